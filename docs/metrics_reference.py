@@ -1,4 +1,4 @@
-"""Figures of scikit-image, scipy, trimesh and the `lpips` package, which the metrics are held to: writes
+"""Figures of scikit-image, scipy and trimesh, which the metrics are held to: writes
 tests/data/metrics/expected.json and the meshes beside it. Needs numpy, scipy, scikit-image, trimesh, rtree, torch,
 torchvision and lpips from PyPI; nothing is downloaded.
 
@@ -9,9 +9,8 @@ import json
 from pathlib import Path
 
 import numpy as np
-import torch
 import trimesh
-from lpips_reference import formula, numbers
+from lpips_reference import numbers
 from PIL import Image
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -50,7 +49,6 @@ def figures(a, b, inside=None):
     return psnr, ssim
 
 
-metric = formula()
 h, w = 256, 160
 cases = {
     "noise": (noise(1, h, w), noise(2, h, w)),
@@ -66,9 +64,6 @@ for name, (a8, b8) in cases.items():
     a, b = a8.astype(np.float64) / 255, b8.astype(np.float64) / 255
     height, width = b.shape[:2]
     psnr, ssim = figures(a, b)
-    to_tensor = lambda p: torch.tensor(p.transpose(2, 0, 1)[None].astype(np.float32))
-    with torch.no_grad():
-        distance = metric(to_tensor(a), to_tensor(b), normalize=True).item()
     # The paper's window: 1000 × 500 of 1024, around the box of what is not exactly black, pushed inside.
     lit = np.argwhere((b8 != 0).any(axis=2))
     (top, left), (bottom, right) = lit.min(0), lit.max(0)
@@ -86,7 +81,6 @@ for name, (a8, b8) in cases.items():
         "all": [psnr, ssim],
         "paper": [*paper, int(x), int(y), ww, wh],
         "mask": [*masked, int(inside.sum())],
-        "lpips": distance,
     }
 
 points = lambda stream, n: (2 * numbers(stream, 3 * n) - 1).reshape(n, 3).astype(np.float32)

@@ -22,12 +22,15 @@ const TRUE_COUNT: usize = 60;
 /// Side of the pictures in pixels.
 const SIZE: u32 = 64;
 const VIEWS: usize = 8;
+/// Steps of a fit, unless the command line has another number.
+pub const STEPS: usize = 300;
 /// Views that a step compares.
 const BATCH: usize = 2;
 
-/// Uniformly random values.
+/// Uniformly random values, drawn on the CPU: all devices get the same ones.
 fn uniform(size: [usize; 2], low: f64, high: f64, device: &Device) -> Tensor<2> {
-    Tensor::random(size, Distribution::Uniform(low, high), device)
+    let values = Tensor::<2>::random(size, Distribution::Uniform(low, high), &Device::flex());
+    Tensor::from_data(values.into_data(), device)
 }
 
 /// The point that all cameras look at, metres: `[1, 3]`.
@@ -83,13 +86,22 @@ fn pictures(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Tensor<4>, Spla
     Ok(render(gaussians, cameras, &RenderOptions::inria())?.color)
 }
 
-fn main() -> Result<(), Box<dyn Error>> {
-    let steps: usize = std::env::args().nth(1).map_or(Ok(300), |text| text.parse())?;
-    let device = Device::flex();
-    let tracking = device.clone().autodiff();
-    device.seed(1);
+/// The result of a fit.
+pub struct Fit {
+    /// Loss of each step.
+    pub losses: Vec<f32>,
+    /// PSNR in dB of an unseen view before the first step.
+    pub before: f32,
+    /// PSNR in dB of an unseen view after the last step.
+    pub after: f32,
+}
 
-    let scene = scene(&device)?;
+/// Fits random Gaussians to the pictures of a scene.
+pub fn fit(device: &Device, steps: usize) -> Result<Fit, SplatError> {
+    let tracking = device.clone().autodiff();
+    Device::flex().seed(1);
+
+    let scene = scene(device)?;
     let cameras = Camera::orbit(VIEWS, SIZE, SIZE);
     let unseen = [Camera::orbit_at_yaw_degrees(180.0 / VIEWS as f64, SIZE)];
     let truth = Tensor::<4>::from_data(pictures(&scene, &cameras)?.into_data(), &tracking);
@@ -102,17 +114,26 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut model = Model::random(&tracking);
     let before = psnr(&model)?;
     let mut adam = AdamConfig::new().with_epsilon(1e-15).init();
+    let mut losses = Vec::new();
     for step in 0..steps {
         let first = step * BATCH % VIEWS;
         let found = pictures(&model.gaussians()?, &cameras[first..first + BATCH])?;
         let loss = (found - truth.clone().narrow(0, first, BATCH)).square().mean();
-        if step % 50 == 0 {
-            println!("step {step}: loss {:.5}", loss.clone().into_scalar::<f32>());
-        }
+        losses.push(loss.clone().inner());
         let gradients = GradientsParams::from_grads(loss.backward(), &model);
         let rate = 0.02 * 0.05_f64.powf(step as f64 / steps as f64);
         model = adam.step(rate, model, gradients);
     }
-    println!("unseen view: {before:.2} dB before, {:.2} dB after", psnr(&model)?);
+    let losses = losses.into_iter().map(|loss| loss.into_scalar::<f32>()).collect();
+    Ok(Fit { losses, before, after: psnr(&model)? })
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let steps: usize = std::env::args().nth(1).map_or(Ok(STEPS), |text| text.parse())?;
+    let Fit { losses, before, after } = fit(&Device::flex(), steps)?;
+    for (step, loss) in losses.iter().enumerate().step_by(50) {
+        println!("step {step}: loss {loss:.5}");
+    }
+    println!("unseen view: {before:.2} dB before, {after:.2} dB after");
     Ok(())
 }

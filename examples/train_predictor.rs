@@ -17,7 +17,7 @@ use burn::tensor::Device;
 use snapsnap_base::FileError;
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::{Folder, Split};
-use snapsnap_data::prepare::{DataConfig, Subject};
+use snapsnap_data::prepare::DataConfig;
 use snapsnap_data::sample::{Augment, SampleConfig, Stage1, Stage1Batcher, Stage1Item};
 use snapsnap_net::config::Config;
 use snapsnap_net::network::View;
@@ -64,14 +64,13 @@ const BATCH: usize = 4;
 fn data_set(root: &Path, resolution: usize) -> Result<Arc<Folder>, FileError> {
     let mut config = DataConfig::default();
     (config.views.count, config.views.resolution) = (12, resolution as u32);
-    let folder = Folder::create(root, config.description("examples/train_predictor.rs"))?;
-    for (split, count) in PEOPLE {
-        for index in 0..count {
-            let name = format!("{}-{index}", split.name());
-            config.add(&folder, &Subject::plain(split, &name), &synth::person(&name, None))?;
-        }
-    }
-    Ok(Arc::new(folder))
+    let people = PEOPLE.into_iter().flat_map(|(split, count)| (0..count).map(move |index| (split, index)));
+    let people = people.map(|(split, index)| {
+        let name = format!("{}-{index}", split.name());
+        let mesh = synth::person(&name, None);
+        (split, name, mesh)
+    });
+    config.make(root, "examples/train_predictor.rs", people)
 }
 
 /// The losses of these samples.
@@ -114,11 +113,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     let predictor = Some(random_predictor(&config, 1, &tracking));
     let mut networks = Networks { predictor, regressors: Vec::new() };
     let before = error(&networks);
-    let muon = Some(MuonSettings { rate: 5e-3, ..MuonSettings::default() });
-    let optimizer =
-        OptimizerConfig { rate: 3e-3, beta2: 0.99, decay_all: false, muon, ..OptimizerConfig::default() };
-    let mut optimizer = optimizer.init();
-    let schedule = Schedule::Cosine { warm_up: 10, end: 0.01 };
+    let muon = Some(MuonSettings { rate: 5e-3 });
+    let optimizer = OptimizerConfig { rate: 3e-3, beta2: 0.99, muon };
+    let mut optimizer = optimizer.init(false);
+    let schedule = Schedule::Cosine { warm_up: 10 };
     for step in 0..steps {
         let indices = step * BATCH..(step + 1) * BATCH;
         let items = indices.map(|index| train.sample(index)).collect::<Result<_, _>>()?;

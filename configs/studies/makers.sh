@@ -46,5 +46,5 @@ row relief 1400 synth makehuman avatars
 options='--set network.side_heads=false'
 row photographs 2000 synth makehuman avatars
 row photographs-no-synth 2000 makehuman avatars
-options='--set network.sides="completed" --set network.second_layer=true --set samples.second_depth=true'
+options='--set network.sides="completed" --set network.second_layer=true'
 row second 1400 synth makehuman avatars

@@ -59,7 +59,6 @@ regressor() {
 }
 regressor regressor
 regressor free-start --set 'regressor.start="published"'
-regressor free-color --set 'regressor.color="free"'
 if wanted bench; then
   cargo xtask bench --config configs/studies/sweep.toml -o reports/sweep
 fi

@@ -147,7 +147,7 @@ fn png() -> Vec<u8> {
 }
 
 /// A binary glTF of a description and its buffer.
-fn glb(description: &Value, blob: &[u8]) -> Vec<u8> {
+pub fn glb(description: &Value, blob: &[u8]) -> Vec<u8> {
     let mut text = description.to_string().into_bytes();
     text.resize(text.len().next_multiple_of(4), b' ');
     let length = 12 + 8 + text.len() + 8 + blob.len();

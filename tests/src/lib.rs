@@ -4,12 +4,14 @@
 #[cfg(target_os = "linux")]
 pub mod browser;
 pub mod character;
-#[cfg(target_os = "linux")]
-pub mod fuzz;
 pub mod ply;
+pub mod sample;
 pub mod scenes;
 pub mod server;
+pub mod workplace;
 
+use std::collections::BTreeMap;
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
@@ -32,13 +34,11 @@ checkpoint_every = 4
 preview_every = 20
 [optimizer]
 rate = 1e-2
-decay_all = false
 [optimizer.muon]
 rate = 1e-2
 [schedule]
 kind = "cosine"
 warm_up = 2
-end = 0.01
 [stage2]
 alpha_weight = 0.5
 anisotropy_weight = 0.01
@@ -78,7 +78,7 @@ pub fn device() -> Option<Device> {
 fn adapter(kind: DeviceType) -> bool {
     let is_wgpu = matches!(kind, DeviceType::Wgpu);
     let found = std::panic::catch_unwind(|| {
-        let unused = is_wgpu && snapsnap_splat::adapter::is_opengl();
+        let unused = is_wgpu && snapsnap_splat::graphics_api::is_opengl();
         !(unused || Device::enumerate(kind).into_vec().is_empty())
     });
     let found = found.unwrap_or(false);
@@ -115,17 +115,8 @@ pub fn snapsnap() -> Command {
         let target = release.parent().expect("target/release");
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
         let mut build = Command::new(cargo);
-        build.args([
-            "build",
-            "--quiet",
-            "--release",
-            "--package",
-            "snapsnap",
-            "--bin",
-            "snapsnap",
-            "--target-dir",
-        ]);
-        build.arg(target);
+        build.args(["build", "--quiet", "--release", "--package", "snapsnap", "--bin", "snapsnap"]);
+        build.arg("--target-dir").arg(target);
         // The features of the tests' own build.
         if let Some(features) = std::env::var_os("SNAPSNAP_FEATURES") {
             build.arg("--features").arg(features);
@@ -138,12 +129,31 @@ pub fn snapsnap() -> Command {
     command
 }
 
+/// A command that makes a split of a data set of synthetic people, with pictures of 64² pixels.
+pub fn synthetic_people(folder: &Path, split: &str, people: usize, views: usize) -> Command {
+    let (people, views) = (people.to_string(), format!("views.count={views}"));
+    let mut command = snapsnap();
+    command.args(["prepare", "synth", "--seed", "5", "--subjects", &people, "--split", split]);
+    command.args(["--set", &views, "--set", "views.resolution=64", "-o"]).arg(folder);
+    command
+}
+
 /// Sets every value of a weight file in f32.
 pub fn fill_weights(path: &Path, value: f32) {
-    let mut file = std::fs::read(path).expect("reads");
+    let mut file = fs::read(path).expect("reads");
     let header = 8 + u64::from_le_bytes(file[..8].try_into().expect("eight bytes")) as usize;
     file[header..].chunks_exact_mut(4).for_each(|bytes| bytes.copy_from_slice(&value.to_le_bytes()));
-    std::fs::write(path, file).expect("writes");
+    fs::write(path, file).expect("writes");
+}
+
+/// Sets the first values of a tensor of a weight file in f32.
+pub fn set_tensor(path: &Path, name: &str, values: &[f32]) {
+    let mut file = fs::read(path).expect("reads");
+    let parsed = SafeTensors::deserialize(&file).expect("a safetensors file");
+    let start = parsed.tensor(name).expect("the tensor").data().as_ptr() as usize - file.as_ptr() as usize;
+    let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+    file[start..start + bytes.len()].copy_from_slice(&bytes);
+    fs::write(path, file).expect("writes");
 }
 
 /// Runs a command that must succeed. Returns its output.
@@ -161,6 +171,50 @@ pub fn refused(command: &mut Command) -> String {
     assert_eq!(output.status.code(), Some(2), "{command:?}: {err}");
     assert!(!err.contains("panicked"), "{err}");
     err
+}
+
+/// The command under a limit of `ulimit`: `-v` kilobytes of memory, or files of `-f` blocks, which imitate a full disk.
+pub fn limited(command: &Command, limit: &str) -> Command {
+    let mut shell = Command::new("sh");
+    // The shell ignores the signal of a file that is too long, so that the program gets an error.
+    shell.arg("-c").arg(format!("trap '' XFSZ; ulimit {limit}; exec \"$@\"")).arg("sh");
+    shell.arg(command.get_program()).args(command.get_args());
+    if let Some(folder) = command.get_current_dir() {
+        shell.current_dir(folder);
+    }
+    shell
+}
+
+/// Every regular file below a folder: its path from there, and its content.
+pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in fs::read_dir(folder).expect("lists").map(|entry| entry.expect("an entry")) {
+        let (path, name) = (entry.path(), PathBuf::from(entry.file_name()));
+        if path.is_dir() {
+            found.extend(files(&path).into_iter().map(|(below, content)| (name.join(below), content)));
+        } else if path.is_file() {
+            found.insert(name, fs::read(path).expect("reads"));
+        }
+    }
+    found
+}
+
+/// Names of the entries of a folder, in their order.
+pub fn names(folder: &Path) -> Vec<String> {
+    let entries = fs::read_dir(folder).expect("lists").map(|entry| entry.expect("an entry").file_name());
+    let mut names: Vec<String> = entries.map(|name| name.into_string().expect("UTF-8")).collect();
+    names.sort();
+    names
+}
+
+/// Copies a folder with everything below it.
+pub fn copy_folder(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("makes");
+    for (name, content) in files(from) {
+        let target = to.join(name);
+        fs::create_dir_all(target.parent().expect("a folder")).expect("makes");
+        fs::write(target, content).expect("writes");
+    }
 }
 
 /// The repository, or the folder `SNAPSNAP_ROOT` with its `configs` and `tests/data`.
@@ -201,7 +255,7 @@ pub fn start_error(got: &[f32], expected: &[f32]) -> f64 {
 
 /// The TOML config of a fixture's `config.json`, with every quirk.
 pub fn toml_config(json: &Path) -> String {
-    let text = std::fs::read_to_string(json).expect("config.json");
+    let text = fs::read_to_string(json).expect("config.json");
     let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
     let same = [
         "enc_dim",
@@ -219,7 +273,9 @@ pub fn toml_config(json: &Path) -> String {
         "net_resolution",
         "conf_threshold",
     ];
-    let lines: Vec<String> = same.iter().map(|key| format!("{key} = {}", json[key])).collect();
+    let there = same.iter().filter(|key| !json[**key].is_null());
+    let mut lines: Vec<String> = there.map(|key| format!("{key} = {}", json[*key])).collect();
+    lines.push(format!("conf_mode = {}", json["conf_mode"][0]));
     format!("[network]\n{}\n[mode]\ncompat = true\n", lines.join("\n"))
 }
 
@@ -234,7 +290,7 @@ pub struct Numbers(Vec<u8>);
 impl Numbers {
     /// Reads the file.
     pub fn read(path: &Path) -> Self {
-        Self(std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display())))
+        Self(fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display())))
     }
 
     /// Whether there is a tensor of this name.

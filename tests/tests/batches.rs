@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use snapsnap_tests::{refused, root, snapsnap, succeed};
+use snapsnap_tests::{limited, names, refused, root, sample, snapsnap, succeed};
 
 /// The sample pair, small, under these names.
 fn pair(folder: &Path, front: &str, back: &str) {
     for (side, name) in [("front", front), ("back", back)] {
-        let picture = image::open(root().join(format!("assets/sample/{side}.png"))).expect("the sample");
-        picture.thumbnail(256, 256).save(folder.join(name)).expect("written");
+        let small = image::imageops::thumbnail(&sample::picture(side), 256, 256);
+        small.save(folder.join(name)).expect("written");
     }
 }
 
@@ -33,13 +33,6 @@ fn failed(command: &mut Command, list: &Path) -> Vec<[String; 2]> {
     rows.deserialize().map(|row| row.expect("a row")).collect()
 }
 
-fn names(folder: &Path) -> Vec<String> {
-    let entries = fs::read_dir(folder).expect("lists").map(|entry| entry.expect("an entry").file_name());
-    let mut names: Vec<String> = entries.map(|name| name.into_string().expect("UTF-8")).collect();
-    names.sort();
-    names
-}
-
 #[test]
 fn a_table_of_pairs_becomes_the_people_of_single_calls() {
     let temporary = tempfile::tempdir().expect("temporary folder");
@@ -59,13 +52,8 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
     assert_eq!(names(&out), ["anna.ply", "errors.csv", "other.ply", "pairs.config.toml", "turned.ply"]);
     let single = temporary.path().join("single.ply");
     let mut one = snapsnap();
-    one.args(["reconstruct", "--device", "cpu", "--set", "network.resolution=256"]);
-    succeed(
-        one.arg(photographs.join("anna_front.png"))
-            .arg(photographs.join("anna_back.png"))
-            .arg("-o")
-            .arg(&single),
-    );
+    one.args(["reconstruct", "--device", "cpu", "--set", "network.resolution=256", "-o"]).arg(&single);
+    succeed(one.args(["anna_front.png", "anna_back.png"].map(|name| photographs.join(name))));
     let [expected, anna, other, turned] =
         [single, out.join("anna.ply"), out.join("other.ply"), out.join("turned.ply")]
             .map(|path| fs::read(path).expect("reads"));
@@ -182,10 +170,10 @@ fn wrong_batches_are_refused() {
         refused(&mut reconstruct(&table, &out))
     };
     for (content, message) in [
-        ("", "no column `front`"),
+        ("", "has no column `front`"),
         ("front,back\n", "no pair"),
-        ("front,rear\na,b\n", "column `rear`"),
-        ("front,back,front\na,b,c\n", "column `front`"),
+        ("front,rear\na,b\n", "has no column `back`"),
+        ("front,back,front\na,b,c\n", "duplicate field `front`"),
         ("front,back\na\n", "found record with 1 fields"),
         ("front,back\na,\n", "line 2: needs a front and a back"),
         ("front,back\nfront.png,back.png\n", "line 2: needs a name"),
@@ -232,10 +220,7 @@ fn batches_end_on_a_full_disk_and_go_on_after_a_kill() {
     for i in 0..6 {
         pair(&photographs, &format!("{i}_front.png"), &format!("{i}_back.png"));
     }
-    let command = reconstruct(&photographs, &out);
-    let mut shell = Command::new("sh");
-    shell.args(["-c", "trap '' XFSZ; ulimit -f 50; exec \"$@\"", "sh"]).arg(command.get_program());
-    let said = refused(shell.args(command.get_args()));
+    let said = refused(&mut limited(&reconstruct(&photographs, &out), "-f 50"));
     assert!(said.contains("cannot write"), "{said}");
     assert_eq!(names(&out), ["pairs.config.toml"]);
     let file = |i: usize| out.join(format!("{i}.ply"));

@@ -6,10 +6,11 @@ use std::path::Path;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use base64::prelude::{BASE64_STANDARD, Engine};
 use serde_json::{Value, json};
 use snapsnap_tests::browser::Page;
 use snapsnap_tests::server::Server;
-use snapsnap_tests::{data, root, snapsnap, succeed};
+use snapsnap_tests::{data, sample, snapsnap, succeed};
 
 const SIDE: u32 = 768;
 /// Longest time until a state of the page.
@@ -56,7 +57,7 @@ fn check_rest(page: &mut Page, folder: &Path) {
         before = now;
     }
     let seen = page.ask("Page.captureScreenshot", json!({ "format": "png" }));
-    let seen = base64(seen["data"].as_str().expect("a picture"));
+    let seen = BASE64_STANDARD.decode(seen["data"].as_str().expect("a picture")).expect("base64");
     let seen = image::load_from_memory(&seen).expect("a picture").into_rgb8();
     let shot = folder.join("rest.png");
     screenshot(page, &shot);
@@ -69,16 +70,6 @@ fn check_rest(page: &mut Page, folder: &Path) {
     let close = |a: [u8; 3], b: [u8; 3]| a.iter().zip(b).all(|(a, b)| a.abs_diff(b) <= 1);
     let other = all.find(|(x, y)| !close(seen.get_pixel(*x, *y).0, shot.get_pixel(*x, *y).0));
     assert_eq!(other, None, "the screen shows something else");
-}
-
-fn base64(text: &str) -> Vec<u8> {
-    const DIGITS: &str = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let digits: Vec<u32> = text.chars().filter_map(|c| DIGITS.find(c)).map(|digit| digit as u32).collect();
-    let bytes = digits.chunks(4).flat_map(|four| {
-        let bits = four.iter().fold(0, |bits, digit| bits << 6 | digit) << (6 * (4 - four.len()));
-        bits.to_be_bytes().into_iter().skip(1).take(four.len() - 1)
-    });
-    bytes.collect()
 }
 
 /// dB between what the page shows and our own render of the file by the page's camera.
@@ -116,11 +107,9 @@ fn a_browser_shows_the_person_and_turns_it() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let folder = temporary.path();
     let file = folder.join("human.ply");
-    let sample = root().join("assets/sample");
-    let mut reconstruct = snapsnap();
-    reconstruct.arg("reconstruct").arg(sample.join("front.png")).arg(sample.join("back.png"));
     // A software GPU draws one frame a second of the default's 340,000 Gaussians.
-    succeed(reconstruct.args(["--set", "network.resolution=256", "--device", "cpu", "-o"]).arg(&file));
+    let mut reconstruct = sample::reconstruct(folder, &sample::paths());
+    succeed(reconstruct.args(["--set", "network.resolution=256"]));
 
     let server = Server::new(&file);
     let url = format!("http://127.0.0.1:{}/", server.port);

@@ -8,21 +8,13 @@ use glam::{DMat3, DVec2};
 use image::RgbaImage;
 use image::imageops::interpolate_bilinear;
 use snapsnap_splat::scene;
-use snapsnap_tests::{refused, root, snapsnap, succeed};
-
-/// The sample pair.
-fn pair() -> [PathBuf; 2] {
-    ["front", "back"].map(|side| root().join(format!("assets/sample/{side}.png")))
-}
+use snapsnap_tests::{refused, sample, succeed};
 
 /// What `reconstruct -v` prints, and the centres of its Gaussians.
-fn reconstruct(folder: &Path, [front, back]: &[PathBuf; 2], options: &[&str]) -> (String, Vec<[f32; 3]>) {
-    let output = folder.join("human.ply");
-    let mut command = snapsnap();
-    command.arg("reconstruct").arg(front).arg(back).arg("-o").arg(&output);
-    let said =
-        succeed(command.args(["-v", "--device", "cpu", "--set", "network.resolution=256"]).args(options));
-    let means = scene::read(&output, &Device::flex()).expect("a PLY").gaussians.means;
+fn reconstruct(folder: &Path, pair: &[PathBuf; 2], options: &[&str]) -> (String, Vec<[f32; 3]>) {
+    let mut command = sample::reconstruct(folder, pair);
+    let said = succeed(command.args(["-v", "--set", "network.resolution=256"]).args(options));
+    let means = scene::read(&folder.join("human.ply"), &Device::flex()).expect("a PLY").gaussians.means;
     let values: Vec<f32> = means.into_data().try_into_vec().expect("f32");
     (said, values.as_chunks::<3>().0.to_vec())
 }
@@ -34,8 +26,8 @@ fn range(values: impl Iterator<Item = f32>) -> [f32; 2] {
 #[test]
 fn a_person_has_the_given_height() {
     let temporary = tempfile::tempdir().expect("temporary folder");
-    let (_, usual) = reconstruct(temporary.path(), &pair(), &[]);
-    let (_, child) = reconstruct(temporary.path(), &pair(), &["--height", "1.1"]);
+    let (_, usual) = reconstruct(temporary.path(), &sample::paths(), &[]);
+    let (_, child) = reconstruct(temporary.path(), &sample::paths(), &["--height", "1.1"]);
     let [high, low] = [&usual, &child].map(|points| {
         let [floor, top] = range(points.iter().map(|p| p[1]));
         top - floor
@@ -52,8 +44,9 @@ fn a_person_has_the_given_height() {
 #[test]
 fn a_restored_person_stands_on_the_floor() {
     let temporary = tempfile::tempdir().expect("temporary folder");
-    let (_, nominal) = reconstruct(temporary.path(), &pair(), &["--height", "1.8"]);
-    let (_, level) = reconstruct(temporary.path(), &pair(), &["--height", "1.8", "--elevation", "-5"]);
+    let (_, nominal) = reconstruct(temporary.path(), &sample::paths(), &["--height", "1.8"]);
+    let (_, level) =
+        reconstruct(temporary.path(), &sample::paths(), &["--height", "1.8", "--elevation", "-5"]);
     let [[floor, _], [low, top]] = [&nominal, &level].map(|points| range(points.iter().map(|p| p[1])));
     assert!((1.79..1.83).contains(&(top - low)) && (low - floor).abs() < 0.02, "{low} to {top}, {floor}");
     assert!(nominal.iter().zip(&level).any(|(a, b)| (a[1] - b[1]).abs() > 0.01));
@@ -65,15 +58,7 @@ fn a_telephone_tells_its_lens_and_its_tilt() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let folder = temporary.path();
     let photographs = ["front", "back"].map(|side| {
-        let picture =
-            image::open(root().join(format!("assets/sample/{side}.png"))).expect("the sample").to_rgba8();
-        let over = image::RgbImage::from_fn(1024, 1024, |x, y| {
-            let pixel = picture.get_pixel(x, y);
-            let mixed = |c: usize| {
-                (u32::from(pixel[c]) * u32::from(pixel[3]) + 200 * (255 - u32::from(pixel[3]))) / 255
-            };
-            image::Rgb([0, 1, 2].map(|c| mixed(c) as u8))
-        });
+        let over = sample::over(&sample::picture(side), |_, _| [200.0; 3]);
         let path = folder.join(side).with_extension("jpg");
         over.save(&path).expect("written");
         let bytes = fs::read(&path).expect("read");
@@ -110,8 +95,7 @@ fn a_known_lens_turns_pictures_towards_the_person() {
     let folder = temporary.path();
     let rotation = DMat3::from_rotation_y(-17_f64.to_radians());
     let aside = ["front", "back"].map(|side| {
-        let path = root().join(format!("assets/sample/{side}.png"));
-        let picture = image::open(path).expect("the sample").to_rgba8();
+        let picture = sample::picture(side);
         let turned = RgbaImage::from_fn(1024, 1024, |x, y| {
             let place = (DVec2::new(f64::from(x), f64::from(y)) + 0.5 - 512.0) / FOCAL;
             let ray = rotation * place.extend(1.0);
@@ -124,7 +108,7 @@ fn a_known_lens_turns_pictures_towards_the_person() {
     });
     // The lens of 0.8 times the picture's side.
     let focal = ["--focal", "24.477"];
-    let (_, ahead) = reconstruct(folder, &pair(), &focal);
+    let (_, ahead) = reconstruct(folder, &sample::paths(), &focal);
     let (said, turned) = reconstruct(folder, &aside, &focal);
     assert_eq!(said.matches("turned towards the person by 1").count(), 2, "{said}");
     let (said, unknown) = reconstruct(folder, &aside, &[]);
@@ -143,11 +127,8 @@ fn a_known_lens_turns_pictures_towards_the_person() {
 
 #[test]
 fn impossible_cameras_are_refused() {
-    let [front, back] = pair();
-    let message = |options: &[&str]| {
-        let mut command = snapsnap();
-        refused(command.arg("reconstruct").arg(&front).arg(&back).args(options))
-    };
+    let message =
+        |options: &[&str]| refused(sample::reconstruct(Path::new("."), &sample::paths()).args(options));
     for (option, value) in [
         ("--height", "0"),
         ("--height", "NaN"),

@@ -1,4 +1,4 @@
-//! Every page and heading that a comment or a page cites is in the repository.
+//! Every page and heading that a comment or a page cites, and every file that a page links to, is in the repository.
 
 use std::fs;
 use std::path::Path;
@@ -7,7 +7,7 @@ use snapsnap_tests::root;
 
 /// Folders and files that are read.
 const PLACES: &str =
-    "crates tests xtask configs docs datasets examples README.md CHANGELOG.md CONTRIBUTING.md";
+    "crates tests xtask configs docs datasets examples assets README.md CHANGELOG.md CONTRIBUTING.md";
 /// Files with these endings are text.
 const ENDINGS: [&str; 7] = ["rs", "toml", "md", "py", "sh", "mjs", "js"];
 /// Names of pages that the program writes or serves, and of a placeholder.
@@ -36,7 +36,7 @@ fn problem(path: &str, page: &str, rest: &str) -> Option<String> {
     (!text.lines().any(is_it)).then(|| format!("{page} has no heading \"{heading}\""))
 }
 
-/// `path:line: problem` of every citation in a file's text that leads nowhere.
+/// `path:line: problem` of every citation in a file's text, and of every link of a page, that leads nowhere.
 fn wrong(path: &str, text: &str) -> Vec<String> {
     let mut found = Vec::new();
     for (number, line) in (1..).zip(text.lines()) {
@@ -51,6 +51,12 @@ fn wrong(path: &str, text: &str) -> Vec<String> {
             let is_other = page.starts_with('/') || page == ".md" || is_longer;
             if is_cited && !is_other && !OUTPUTS.iter().any(|name| page.ends_with(name)) {
                 problem(path, page, rest).into_iter().for_each(&mut add);
+            }
+        }
+        let links = line.split("](").skip(1).filter_map(|rest| rest.split([')', '#']).next());
+        for link in links.filter(|link| path.ends_with(".md") && !link.contains("://")) {
+            if !root().join(path).with_file_name(link).exists() {
+                add(format!("there is no {link}"));
             }
         }
         if line.split("SNAPSNAP").skip(1).any(|rest| rest.is_empty() || rest.starts_with(' ')) {
@@ -74,7 +80,7 @@ fn visit(path: &str) -> Vec<String> {
 }
 
 #[test]
-fn every_citation_leads_to_a_page_and_a_heading() {
+fn every_citation_and_every_link_leads_somewhere() {
     let found: Vec<String> = PLACES.split(' ').flat_map(visit).collect();
     assert!(found.is_empty(), "{} citations lead nowhere:\n{}", found.len(), found.join("\n"));
 }
@@ -84,6 +90,7 @@ fn wrong_citations_are_found() {
     let cited = ["docs/absent.md", "docs/method.md, \"Absent\"", "LEARNING.md", "SNAPSNAP §1"];
     let found = cited.map(|cited| wrong("crates/net/src/lib.rs", &format!("//! As in {cited}.")).len());
     assert_eq!(found, [1; 4]);
+    assert_eq!(wrong("docs/method.md", "[as here](absent.svg)").len(), 1);
     let right = "//! docs/method.md, \"Ray anchors\", README.md, SNAPSNAP_ROOT, report.md";
     assert!(wrong("crates/net/src/lib.rs", right).is_empty());
 }

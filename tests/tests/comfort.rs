@@ -3,12 +3,8 @@
 use std::fs;
 
 use serde_json::Value;
-use snapsnap_tests::{fill_weights, refused, root, snapsnap, succeed};
-
-/// A config of the repository.
-fn config(name: &str) -> String {
-    root().join("configs").join(name).display().to_string()
-}
+use snapsnap_tests::workplace::Workplace;
+use snapsnap_tests::{fill_weights, limited, refused, root, snapsnap, succeed};
 
 #[test]
 fn the_doctor_names_devices_weights_and_what_mends() {
@@ -68,38 +64,24 @@ fn a_report_that_the_disk_does_not_take_is_a_failure() {
 
 #[test]
 fn values_that_are_not_finite_are_no_sound_weights() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = temporary.path().join("w.safetensors");
-    succeed(
-        snapsnap().args(["init-weights", "--config", &config("tiny.toml"), "--seed", "1", "-o"]).arg(&path),
-    );
-    fill_weights(&path, f32::NAN);
-    let said = refused(snapsnap().arg("doctor").arg("--weights").arg(&path));
+    let place = Workplace::with_weights();
+    fill_weights(&place.path("w"), f32::NAN);
+    let said = refused(&mut place.run("doctor --weights w"));
     assert!(said.contains("not finite"), "{said}");
 }
 
 #[test]
 fn weights_of_another_size_are_refused_in_a_few_lines() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = temporary.path().join("w.safetensors");
-    succeed(
-        snapsnap().args(["init-weights", "--config", &config("tiny.toml"), "--seed", "1", "-o"]).arg(&path),
-    );
-    let mut command = snapsnap();
-    command.args(["reconstruct", "a.png", "b.png", "--config", &config("full.toml"), "--weights"]).arg(&path);
-    let said = refused(&mut command);
+    let place = Workplace::with_weights();
+    let full = root().join("configs/full.toml");
+    let said = refused(place.run("reconstruct a.png b.png --weights w --config").arg(&full));
     assert!(
         said.contains("not the weights of the configured networks") && said.contains("`network."),
         "{said}"
     );
     assert!(said.lines().count() < 4, "{said}");
     // An import has no stored config to compare.
-    let said = refused(
-        snapsnap()
-            .args(["import-weights", "-o", "x.safetensors"])
-            .arg(&path)
-            .args(["--config", &config("full.toml")]),
-    );
+    let said = refused(place.run("import-weights w -o x.safetensors --config").arg(&full));
     assert!(said.contains("more") && said.lines().count() < 20, "{said}");
 }
 
@@ -124,14 +106,8 @@ fn loaders_of_drivers_print_nothing() {
 #[test]
 #[cfg(target_os = "linux")]
 fn drivers_crash_no_command() {
-    for limit in ["1000000", "1500000"] {
-        let output = std::process::Command::new("sh")
-            .args(["-c", &format!("ulimit -v {limit}; exec \"$@\""), "sh"])
-            .arg(snapsnap().get_program())
-            .arg("doctor")
-            .output()
-            .expect("runs");
-        assert_eq!(output.status.code(), Some(0), "{limit}: {}", String::from_utf8_lossy(&output.stderr));
+    for limit in ["-v 1000000", "-v 1500000"] {
+        succeed(&mut limited(snapsnap().arg("doctor"), limit));
     }
 }
 

@@ -1,28 +1,13 @@
 //! Photographs with a background: the matting network, the edges and colours of cut-outs, and the options.
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 use burn::tensor::Device;
 use image::{Rgb, RgbImage, RgbaImage};
 use snapsnap_net::u2net::U2Net;
 use snapsnap_net::weights::Source;
-use snapsnap_tests::{data, refused, root, snapsnap, succeed};
-
-/// The sample's picture of one side.
-fn sample(side: &str) -> RgbaImage {
-    image::open(root().join(format!("assets/sample/{side}.png"))).expect("the sample").to_rgba8()
-}
-
-/// A picture over a background.
-fn over(picture: &RgbaImage, background: impl Fn(u32, u32) -> [f32; 3]) -> RgbImage {
-    RgbImage::from_fn(picture.width(), picture.height(), |x, y| {
-        let ([r, g, b, a], behind) = (picture.get_pixel(x, y).0, background(x, y));
-        let share = f32::from(a) / 255.0;
-        let mixed = |own: u8, other: f32| (share * f32::from(own) + (1.0 - share) * other).round() as u8;
-        Rgb([mixed(r, behind[0]), mixed(g, behind[1]), mixed(b, behind[2])])
-    })
-}
+use snapsnap_tests::sample::{over, paths, picture, reconstruct};
+use snapsnap_tests::{data, refused, root, succeed};
 
 /// A wall that gets darker to the right, a window, a floor, and noise.
 fn room(x: u32, y: u32) -> [f32; 3] {
@@ -43,15 +28,9 @@ fn room(x: u32, y: u32) -> [f32; 3] {
 fn pair(folder: &Path) -> [PathBuf; 2] {
     ["front", "back"].map(|side| {
         let path = folder.join(format!("{side} in a room.png"));
-        over(&sample(side), room).save(&path).expect("written");
+        over(&picture(side), room).save(&path).expect("written");
         path
     })
-}
-
-fn reconstruct(folder: &Path, [front, back]: &[PathBuf; 2]) -> Command {
-    let mut command = snapsnap();
-    command.args(["reconstruct", "--device", "cpu", "-o"]).arg(folder.join("human.ply")).arg(front).arg(back);
-    command
 }
 
 fn share(of: impl Iterator<Item = bool>) -> f64 {
@@ -62,7 +41,7 @@ fn share(of: impl Iterator<Item = bool>) -> f64 {
 /// `docs/u2netp_convert.py` wrote the reference: ONNX Runtime's output for the same picture, at every eighth pixel.
 #[test]
 fn the_network_is_that_of_onnx_runtime() {
-    let front = sample("front");
+    let front = picture("front");
     let at = |row: u32| row * front.width() / 320;
     let value = |channel: usize| {
         let front = &front;
@@ -99,7 +78,7 @@ fn people_in_a_room_are_cut_out() {
     assert!(said.contains("cut out by the network"), "{said}");
     assert!(temporary.path().join("human.ply").exists());
     for side in ["front", "back"] {
-        let (truth, photograph) = (sample(side), over(&sample(side), room));
+        let (truth, photograph) = (picture(side), over(&picture(side), room));
         let found = image::open(cutouts.join(format!("{side}.png"))).expect("a cut-out").to_rgba8();
         assert_eq!(found.dimensions(), truth.dimensions());
         let inside = |picture: &RgbaImage| picture.pixels().map(|p| p[3] > 127).collect::<Vec<_>>();
@@ -130,7 +109,7 @@ fn people_in_a_room_are_cut_out() {
 #[test]
 fn alpha_channels_win_unless_the_network_is_asked_for() {
     let temporary = tempfile::tempdir().expect("temporary folder");
-    let photographs = ["front", "back"].map(|side| root().join(format!("assets/sample/{side}.png")));
+    let photographs = paths();
     let cutouts = temporary.path().join("cutouts");
     succeed(reconstruct(temporary.path(), &photographs).arg("--save-cutouts").arg(&cutouts));
     let alpha = |path: &Path| -> Vec<u8> {
@@ -148,11 +127,8 @@ fn what_cannot_be_cut_out_is_refused() {
     let photographs = pair(temporary.path());
     let none = refused(reconstruct(temporary.path(), &photographs).args(["--cutout", "none"]));
     assert!(none.contains("front in a room.png") && none.contains("--cutout auto"), "{none}");
-    let masks = refused(
-        reconstruct(temporary.path(), &photographs)
-            .args(["--cutout", "network", "--masks"])
-            .args(["front", "back"].map(|side| root().join(format!("assets/sample/{side}.png")))),
-    );
+    let mut masked = reconstruct(temporary.path(), &photographs);
+    let masks = refused(masked.args(["--cutout", "network", "--masks"]).args(paths()));
     assert!(masks.contains("--masks already"), "{masks}");
     // A wall alone.
     let empty = ["a.png", "b.png"].map(|name| {
@@ -162,14 +138,5 @@ fn what_cannot_be_cut_out_is_refused() {
     });
     let nobody = refused(&mut reconstruct(temporary.path(), &empty));
     assert!(nobody.contains("a.png") && nobody.contains("no person was found"), "{nobody}");
-    // A cut-out would replace a photograph.
-    let folder = temporary.path().join("own");
-    std::fs::create_dir(&folder).expect("a folder");
-    let own = ["front.png", "back.png"].map(|name| folder.join(name));
-    for (from, to) in photographs.iter().zip(&own) {
-        std::fs::copy(from, to).expect("a copy");
-    }
-    let input = refused(reconstruct(temporary.path(), &own).arg("--save-cutouts").arg(&folder));
-    assert!(input.contains("is an input of this command"), "{input}");
     assert!(!temporary.path().join("human.ply").exists());
 }

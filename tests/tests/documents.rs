@@ -5,11 +5,11 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::Command;
 use std::time::Instant;
 
-use snapsnap_tests::{data, root, shared, snapsnap, succeed, toml_config};
+use snapsnap_tests::{data, root, sample, shared, snapsnap, succeed, toml_config};
 
 /// In reading order: a page's commands use the outputs of earlier pages.
 const PAGES: [&str; 14] = [
@@ -231,8 +231,7 @@ fn place() -> tempfile::TempDir {
         symlink(root().join(name), to(name)).expect("linked");
     }
     for side in ["front", "back"] {
-        let picture =
-            image::open(root().join(format!("assets/sample/{side}.png"))).expect("a picture").into_rgba8();
+        let picture = sample::picture(side);
         picture.save(to(&format!("{side}.png"))).expect("saved");
         let mask = image::GrayImage::from_fn(picture.width(), picture.height(), |x, y| {
             image::Luma([picture.get_pixel(x, y)[3]])
@@ -334,25 +333,4 @@ fn help(own: &[String]) -> String {
     let below =
         own.iter().skip(1).take_while(|word| own[0] == "prepare" && word.chars().all(char::is_alphabetic));
     succeed(snapsnap().arg(&own[0]).args(below.take(1)).arg("--help"))
-}
-
-/// Links from page to page lead somewhere.
-#[test]
-fn links_within_the_repository_lead_somewhere() {
-    let notes =
-        fs::read_dir(root().join("docs/notes")).expect("lists").map(|entry| entry.expect("an entry").path());
-    let notes = notes.map(|path| format!("docs/notes/{}", path.file_name().expect("a name").display()));
-    let others =
-        ["assets/README.md", "assets/weights/README.md", "assets/sample/README.md", "docs/stability.md"];
-    let pages: Vec<String> = PAGES.into_iter().chain(others).map(str::to_owned).chain(notes).collect();
-    for page in &pages {
-        let text = fs::read_to_string(root().join(page)).unwrap_or_else(|e| panic!("{page}: {e}"));
-        let folder = Path::new(page).parent().expect("a folder");
-        for target in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
-            let file = target.split('#').next().expect("a part");
-            if !target.contains("://") && !file.is_empty() {
-                assert!(root().join(folder).join(file).exists(), "{page}: {target}");
-            }
-        }
-    }
 }

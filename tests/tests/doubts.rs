@@ -1,29 +1,18 @@
 //! Doubts about photographs that do not show the front and the back of one upright person.
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 use image::{DynamicImage, GrayImage, Luma, RgbaImage};
+use snapsnap_tests::sample::{picture, reconstruct};
 use snapsnap_tests::{refused, root, snapsnap, succeed};
-
-/// The sample's picture of one side.
-fn sample(side: &str) -> RgbaImage {
-    image::open(root().join(format!("assets/sample/{side}.png"))).expect("the sample").to_rgba8()
-}
 
 /// The sample with each picture changed.
 fn pair(folder: &Path, change: impl Fn(RgbaImage) -> RgbaImage) -> [PathBuf; 2] {
     ["front", "back"].map(|side| {
         let path = folder.join(format!("{side}.png"));
-        change(sample(side)).save(&path).expect("written");
+        change(picture(side)).save(&path).expect("written");
         path
     })
-}
-
-fn reconstruct(folder: &Path, [front, back]: &[PathBuf; 2]) -> Command {
-    let mut command = snapsnap();
-    command.args(["reconstruct", "--device", "cpu", "-o"]).arg(folder.join("human.ply")).arg(front).arg(back);
-    command
 }
 
 /// The message of --strict, which writes nothing.
@@ -47,10 +36,10 @@ fn an_inverted_mask_is_noticed() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let photographs = pair(temporary.path(), |picture| picture);
     let masks = ["front", "back"].map(|side| {
-        let picture = sample(side);
-        let inverted = |x, y| Luma([255 - picture.get_pixel(x, y)[3]]);
+        let own = picture(side);
+        let inverted = |x, y| Luma([255 - own.get_pixel(x, y)[3]]);
         let path = temporary.path().join(format!("{side}_mask.png"));
-        GrayImage::from_fn(picture.width(), picture.height(), inverted).save(&path).expect("written");
+        GrayImage::from_fn(own.width(), own.height(), inverted).save(&path).expect("written");
         path
     });
     let more: Vec<PathBuf> = ["--masks".into()].into_iter().chain(masks).collect();
@@ -73,7 +62,7 @@ fn one_picture_in_place_of_two_is_noticed_and_taken() {
     let twice = [front.clone(), front.clone()];
     assert!(strict(temporary.path(), &twice, &[]).contains("the same picture twice"));
     let flipped = temporary.path().join("flipped.png");
-    image::imageops::flip_horizontal(&sample("front")).save(&flipped).expect("written");
+    image::imageops::flip_horizontal(&picture("front")).save(&flipped).expect("written");
     assert!(strict(temporary.path(), &[front, flipped], &[]).contains("mirror image"));
     let output = reconstruct(temporary.path(), &twice).output().expect("runs");
     let said = String::from_utf8_lossy(&output.stderr);
@@ -85,7 +74,7 @@ fn one_picture_in_place_of_two_is_noticed_and_taken() {
 fn silhouettes_that_do_not_fit_are_noticed() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let [front, back] = pair(temporary.path(), |picture| picture);
-    let mut other = sample("back");
+    let mut other = picture("back");
     let (width, height) = other.dimensions();
     // A cross from corner to corner.
     for (x, y, pixel) in other.enumerate_pixels_mut() {
@@ -144,7 +133,7 @@ fn a_distant_speck_of_the_mask_changes_nothing() {
 fn swapped_pictures_are_noticed_by_the_face() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let [front, back] = pair(temporary.path(), |picture| picture);
-    let mut dark = sample("back");
+    let mut dark = picture("back");
     let top = dark.enumerate_pixels().find(|(.., pixel)| pixel[3] > 127).expect("a person").1;
     let head = top + dark.height() / 9;
     for (_, y, pixel) in dark.enumerate_pixels_mut() {

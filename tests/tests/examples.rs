@@ -8,7 +8,7 @@ use burn::tensor::Device;
 use snapsnap_net::weights::WeightFile;
 use snapsnap_net::weights::schema::Part;
 use snapsnap_splat::scene;
-use snapsnap_tests::{root, snapsnap, succeed};
+use snapsnap_tests::{root, sample, snapsnap, succeed};
 
 /// An example, built if it is not. `--workspace` shares the other tests' build.
 fn example(name: &str) -> Command {
@@ -33,7 +33,7 @@ fn figures(output: &str) -> Vec<f64> {
 #[test]
 fn the_library_reconstructs_what_the_command_does() {
     let temporary = tempfile::tempdir().expect("temporary folder");
-    let photographs = ["front", "back"].map(|side| root().join(format!("assets/sample/{side}.png")));
+    let photographs = sample::paths();
     let [library, command] = ["library.ply", "command.ply"].map(|name| temporary.path().join(name));
     let output = succeed(example("reconstruct").args(&photographs).arg(&library));
     succeed(snapsnap().arg("reconstruct").args(&photographs).args(["--device", "cpu", "-o"]).arg(&command));

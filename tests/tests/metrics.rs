@@ -1,14 +1,10 @@
-//! The metrics against scikit-image, the `lpips` package, scipy and trimesh (docs/metrics_reference.py), and properties
-//! of every metric.
+//! The metrics against scikit-image, scipy and trimesh (docs/metrics_reference.py), and properties of every metric.
 
-use std::path::{Path, PathBuf};
-
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::Device;
 use glam::DVec3;
 use image::{Rgb, RgbImage};
 use serde_json::Value;
 use snapsnap_eval::geometry::{self, chamfer, consistency, icp, normals, point_to_surface};
-use snapsnap_eval::lpips::{self, Lpips};
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::score::Score;
@@ -111,71 +107,6 @@ fn psnr_and_ssim_are_those_of_scikit_image_in_all_three_windows() {
         assert_eq!(Some(masked.pixels() as u64), figures["mask"][2].as_u64(), "{name}");
         check("mask", &masked);
     }
-}
-
-fn random_lpips(device: &Device) -> Lpips {
-    let folder = tempfile::tempdir().expect("a folder");
-    Lpips::load(&[random_weights(folder.path())], device).expect("loads")
-}
-
-/// A file of weights from a formula, as in the reference.
-fn random_weights(folder: &Path) -> PathBuf {
-    const LAYERS: [(usize, [usize; 3]); 5] =
-        [(0, [64, 3, 11]), (3, [192, 64, 5]), (6, [384, 192, 3]), (8, [256, 384, 3]), (10, [256, 256, 3])];
-    let mut tensors = Vec::new();
-    for (i, (place, [outputs, inputs, side])) in LAYERS.into_iter().enumerate() {
-        let (stream, fan_in) = (3 * i as u32, inputs * side * side);
-        let bound = (6.0 / fan_in as f64).sqrt();
-        let values = |stream: u32, count: usize, value: &dyn Fn(f64) -> f64| -> Vec<f32> {
-            (0..count).map(|place| value(number(stream, place)) as f32).collect()
-        };
-        let weight = values(stream, outputs * fan_in, &|u| (2.0 * u - 1.0) * bound);
-        tensors.push((format!("features.{place}.weight"), vec![outputs, inputs, side, side], weight));
-        tensors.push((
-            format!("features.{place}.bias"),
-            vec![outputs],
-            values(stream + 1, outputs, &|u| 0.1 * (u - 0.5)),
-        ));
-        tensors.push((
-            format!("lin{i}.model.1.weight"),
-            vec![1, outputs, 1, 1],
-            values(stream + 2, outputs, &|u| u),
-        ));
-    }
-    let file = folder.join("lpips.safetensors");
-    let names = tensors.iter().map(|(name, shape, _)| (name.clone(), shape.clone())).collect();
-    let values = |i: usize| Ok(tensors[i].2.clone());
-    snapsnap_net::weights::write_tensors(&file, "lpips", Default::default(), names, values, &|_, _| ())
-        .expect("writes");
-    file
-}
-
-#[test]
-fn lpips_is_the_packages_with_the_same_weights() {
-    let (expected, network) = (expected(), random_lpips(&Device::flex()));
-    for (name, figures) in expected["pictures"].as_object().expect("pictures") {
-        let [a, b] = pair(name).map(picture);
-        let score = |a: &Picture, b: &Picture| {
-            Score::new(a, b, &Region::all(b), Some(&network)).expect("one size").lpips.expect("weights")
-        };
-        close(name, score(&a, &b), &figures["lpips"], 1e-5);
-        assert_eq!(score(&a, &a), 0.0, "{name}");
-        assert!((score(&a, &b) - score(&b, &a)).abs() < 1e-6, "{name}: not symmetric");
-    }
-}
-
-#[test]
-fn weights_that_are_not_the_published_ones_are_no_lpips() {
-    let folder = tempfile::tempdir().expect("a folder");
-    assert_eq!(Lpips::missing(folder.path()), lpips::PUBLISHED.map(|name| folder.path().join(name)));
-    // Files with the published names and other contents.
-    let [network, learned] = lpips::PUBLISHED.map(|name| folder.path().join(name));
-    std::fs::rename(random_weights(folder.path()), network).expect("renames");
-    std::fs::write(&learned, []).expect("writes");
-    assert_eq!(Lpips::missing(folder.path()), Vec::<PathBuf>::new());
-    Lpips::published(folder.path(), &Device::flex()).expect_err("an empty file");
-    let known = random_lpips(&Device::flex()).check();
-    assert!((known - 0.093_218).abs() > 0.1, "{known}");
 }
 
 #[test]
@@ -313,14 +244,10 @@ fn normals_of_depth_maps_are_those_of_the_surfaces() {
 
 #[test]
 fn points_that_are_none_are_refused() {
-    let device = Device::flex();
-    let tensor =
-        |values: Vec<f32>, shape: [usize; 2]| Tensor::<2>::from_data(TensorData::new(values, shape), &device);
-    assert_eq!(geometry::points(&tensor(vec![1.0, 2.0, 3.0], [1, 3])).expect("a point"), [[1.0, 2.0, 3.0]]);
-    for (values, shape) in [(vec![], [0, 3]), (vec![1.0, f32::NAN, 0.0], [1, 3]), (vec![0.0; 4], [2, 2])] {
-        geometry::points(&tensor(values, shape)).expect_err("no points");
+    let nothing: &[[f32; 3]] = &[];
+    for points in [nothing, &[[1.0, f32::NAN, 0.0]]] {
+        assert!(chamfer(&[[0.0; 3]], points).is_err() && icp(points, &[[0.0; 3]], false).is_err());
     }
-    assert!(chamfer(&[[0.0; 3]], &[]).is_err() && icp(&[], &[[0.0; 3]], false).is_err());
     let flat = snapsnap_mesh::mesh::Mesh { positions: vec![glam::Vec3::ZERO; 3], ..Default::default() };
     assert!(geometry::sampled(&flat, 10, 1).is_err() && point_to_surface(&[[0.0; 3]], &flat).is_err());
 }

@@ -1,39 +1,19 @@
 //! `snapsnap prepare` as a user types it: data sets of people and scans, broken scans, and runs that are continued.
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use snapsnap_tests::{refused, root, shared, snapsnap, succeed};
+use snapsnap_tests::{files, limited, refused, root, shared, snapsnap, succeed};
 
 /// Settings of small and few views.
 const SMALL: [&str; 4] = ["--set", "views.count=4", "--set", "views.resolution=64"];
-/// Limit of the address space in kilobytes: a tenth of the size in the headers below.
-const MEMORY: u64 = 3_000_000;
 
 fn prepare(kind: &str) -> Command {
     let mut command = snapsnap();
     command.args(["prepare", kind]);
     command
-}
-
-/// Every file below a folder, by its path, with its content.
-fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    let mut folders = vec![folder.to_owned()];
-    while let Some(next) = folders.pop() {
-        for entry in fs::read_dir(&next).expect("list").map(|entry| entry.expect("entry").path()) {
-            if entry.is_dir() {
-                folders.push(entry);
-            } else {
-                let content = fs::read(&entry).expect("read");
-                found.insert(entry.strip_prefix(folder).expect("is below").to_owned(), content);
-            }
-        }
-    }
-    found
 }
 
 fn synth(folder: &Path, subjects: &str) -> Command {
@@ -198,12 +178,8 @@ fn real_scans_with_several_materials_are_imported() {
     // Subjects 0 and 1 are on the published list.
     assert!(folder.join("val/parm/0001/3_extrinsic.npy").is_file());
     let mut only = prepare("scan");
-    only.arg(&scans).arg("-o").arg(temporary.path().join("none")).args([
-        "--collection",
-        "thuman2.0",
-        "--only",
-    ]);
-    assert!(refused(only.arg("train")).contains("none of its scans is in the split"));
+    only.arg(&scans).args(["--collection", "thuman2.0", "--only", "train", "-o"]);
+    assert!(refused(only.arg(temporary.path().join("none"))).contains("none of its scans is in the split"));
     assert!(succeed(prepare("check").arg(&folder)).contains("2 subjects, 8 views: no fault"));
     let picture = image::open(folder.join("val/img/0000/0.jpg")).expect("a picture").into_rgb8();
     // Scan 0000 wears a shirt of dark red and teal over a skirt of green and violet.
@@ -249,12 +225,11 @@ fn broken_scans_are_named_and_skipped() {
     fs::write(scans.join("absurd texture.obj/a.mtl"), "newmtl a\nmap_Kd skin.bmp\n").expect("write");
     fs::write(scans.join("absurd texture.obj/skin.bmp"), absurd).expect("write");
 
-    let program = snapsnap().get_program().to_owned();
     let out = temporary.path().join("out");
-    let mut command = Command::new("sh");
-    command.arg("-c").arg(format!("ulimit -v {MEMORY}; exec \"$@\"")).arg("sh").arg(program);
-    command.args(["prepare", "scan"]).arg(&scans).arg("-o").arg(&out).args(SMALL);
-    let message = refused(&mut command);
+    let mut command = prepare("scan");
+    command.arg(&scans).arg("-o").arg(&out).args(SMALL);
+    // A tenth of the size in the headers.
+    let message = refused(&mut limited(&command, "-v 3000000"));
     let expected = [
         ("trüncated.obj", "line 8, `f 3 1`: a face needs three corners"),
         ("half.obj", "its last 3 of 7 vertices belong to no face"),
@@ -302,7 +277,7 @@ fn wrong_arguments_are_refused_before_any_work() {
         let message = refusal(arguments);
         assert!(message.contains(expected), "{arguments:?}: {message}");
     }
-    for (sheet, reason) in [("sheet.jpg", "must end in .png"), ("set/img.png", "lies inside the data set")] {
+    for (sheet, reason) in [("sheet.jpg", "must end in .png"), ("set/img.png", "lies in a data set")] {
         let set = temporary.path().join("set");
         fs::create_dir_all(&set).expect("make");
         let mut command = prepare("synth");

@@ -12,16 +12,10 @@ use image::{DynamicImage, GrayImage, ImageFormat, Luma};
 use serde_json::{Value, json};
 use snapsnap_splat::scene;
 use snapsnap_tests::server::Server;
-use snapsnap_tests::{root, snapsnap, succeed};
+use snapsnap_tests::{sample, snapsnap, succeed};
 
 /// Side of the canvases.
 const SIDE: u32 = 256;
-
-/// The sample pair's files.
-fn sample() -> [Vec<u8>; 2] {
-    ["front", "back"]
-        .map(|side| fs::read(root().join(format!("assets/sample/{side}.png"))).expect("the sample"))
-}
 
 fn parts(of: &[&[u8]]) -> (String, Vec<u8>) {
     let lengths: Vec<String> = of.iter().map(|part| part.len().to_string()).collect();
@@ -50,7 +44,7 @@ fn people_of_the_studio_are_those_of_reconstruct() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let folder = temporary.path();
     let server = Server::studio(SIDE);
-    let [front, back] = sample();
+    let [front, back] = sample::paths().map(|path| fs::read(path).expect("the sample"));
     let (status, headers, answer) = server.post("/cutout", "X-Job: 1\r\n", &front);
     assert!(status == 200 && headers.contains("x-parts: "), "{headers}");
     let lengths = headers.lines().find_map(|line| line.strip_prefix("x-parts: ")).expect("lengths");
@@ -65,10 +59,8 @@ fn people_of_the_studio_are_those_of_reconstruct() {
     assert!(off.count() < 1000, "the mask is the photograph's own, but for specks and rims");
 
     let name = made(&server, [&front, &back, &[], &[]]);
-    let own = folder.join("own.ply");
-    let mut reconstruct = snapsnap();
-    let paths = ["front", "back"].map(|side| root().join(format!("assets/sample/{side}.png")));
-    reconstruct.arg("reconstruct").args(&paths).args(["--device", "cpu", "-o"]).arg(&own);
+    let own = folder.join("human.ply");
+    let mut reconstruct = sample::reconstruct(folder, &sample::paths());
     succeed(reconstruct.arg("--set").arg(format!("network.resolution={SIDE}")));
     for (path, extension) in [("ply", "ply"), ("spz", "spz"), ("sog", "sog"), ("gaussians.glb", "glb")] {
         let expected = folder.join("expected").with_extension(extension);
@@ -113,7 +105,7 @@ fn people_of_the_studio_are_those_of_reconstruct() {
 #[test]
 fn unsuitable_requests_are_refused_and_others_served() {
     let server = Server::studio(SIDE);
-    let [front, back] = sample();
+    let [front, back] = sample::paths().map(|path| fs::read(path).expect("the sample"));
     assert_eq!(server.ask("GET /", None).0, 200);
     let page = String::from_utf8(server.ask("GET /", None).2).expect("text");
     assert!(page.contains("class=\"studio\""), "{page}");
@@ -203,16 +195,8 @@ mod browser {
     /// The pair over a wall, as JPEG and WebP: with backgrounds.
     fn photographs(folder: &Path) -> [std::path::PathBuf; 2] {
         [("front", "jpg"), ("back", "webp")].map(|(side, extension)| {
-            let picture =
-                image::open(root().join(format!("assets/sample/{side}.png"))).expect("the sample").to_rgba8();
-            let over = image::RgbImage::from_fn(picture.width(), picture.height(), |x, y| {
-                let pixel = picture.get_pixel(x, y);
-                let wall = [150 + (y / 20) as u8, 160, 170];
-                image::Rgb(std::array::from_fn(|c| {
-                    let (own, share) = (u32::from(pixel[c]), u32::from(pixel[3]));
-                    ((own * share + u32::from(wall[c]) * (255 - share)) / 255) as u8
-                }))
-            });
+            let wall = |_: u32, y: u32| [150.0 + (y / 20) as f32, 160.0, 170.0];
+            let over = sample::over(&sample::picture(side), wall);
             let path = folder.join(side).with_extension(extension);
             over.save(&path).expect("written");
             path

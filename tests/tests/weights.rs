@@ -1,16 +1,16 @@
 //! Importing, exporting and refusing checkpoints.
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use snapsnap_base::config::Schema;
 use snapsnap_net::config::Config;
 use snapsnap_net::weights::{
-    CONFIG_KEY, Float, ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init,
-    schema,
+    Entry, Float, ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init, schema,
 };
+use snapsnap_tests::workplace::Workplace;
 use snapsnap_tests::{FIXTURE_VALUES, data, fixture, root};
 
 const OPTIONS: ImportOptions =
@@ -27,70 +27,46 @@ fn read(path: &Path) -> Tensors {
     let source = Source::open(path).expect("readable");
     let value =
         |name: &String| source.read_f32(name).expect("float").iter().flat_map(|v| v.to_le_bytes()).collect();
-    let entry = |(name, e): (&String, &_)| (name.clone(), (Dtype::F32, shape(e), value(name)));
+    let entry = |(name, e): (&String, &Entry)| (name.clone(), (Dtype::F32, e.shape.clone(), value(name)));
     source.tensors().iter().map(entry).collect()
 }
 
-fn shape(entry: &snapsnap_net::weights::Entry) -> Vec<usize> {
-    entry.shape.clone()
-}
-
 fn write(tensors: &Tensors, path: &Path) {
-    write_beside(tensors, None, path);
-}
-
-/// A checkpoint, with or without a config in its metadata.
-fn write_beside(tensors: &Tensors, config: Option<&Config>, path: &Path) {
     let views = tensors.iter().map(|(name, (dtype, shape, bytes))| {
         (name.as_str(), TensorView::new(*dtype, shape.clone(), bytes).expect("consistent"))
     });
-    let metadata = config.map(|config| HashMap::from([(CONFIG_KEY.into(), config.to_toml())]));
-    std::fs::write(path, safetensors::serialize(views, metadata).expect("valid")).expect("written");
+    std::fs::write(path, safetensors::serialize(views, None).expect("valid")).expect("written");
 }
 
-/// A temporary folder with random tiny weights in it.
-struct Workplace {
-    folder: tempfile::TempDir,
-    config: Config,
+/// A folder with random tiny weights in it.
+fn place() -> Workplace {
+    let place = Workplace::empty();
+    init(&tiny(), 1, &place.path("ours.safetensors"), &|_, _| ()).expect("written");
+    place
 }
 
-impl Workplace {
-    fn new() -> Self {
-        let place = Self { folder: tempfile::tempdir().expect("temporary folder"), config: tiny() };
-        init(&place.config, 1, &place.path("ours.safetensors"), &|_, _| ()).expect("written");
-        place
-    }
+/// The random weights, changed.
+fn changed(place: &Workplace, change: impl FnOnce(&mut Tensors)) -> Tensors {
+    let mut tensors = read(&place.path("ours.safetensors"));
+    change(&mut tensors);
+    tensors
+}
 
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
+/// What an import makes of these tensors, with its notes.
+fn import_here(place: &Workplace, tensors: &Tensors) -> Result<(Tensors, Vec<String>), WeightsError> {
+    let (from, to) = (place.path("in.safetensors"), place.path("out.safetensors"));
+    write(tensors, &from);
+    let _ = std::fs::remove_file(&to);
+    let result = import(&[from], &tiny(), OPTIONS, &to, &|_, _| ());
+    assert_eq!(result.is_ok(), to.exists(), "a file is left exactly if the import succeeds");
+    result.map(|report| (read(&to), report.notes))
+}
 
-    /// The random weights, changed.
-    fn changed(&self, change: impl FnOnce(&mut Tensors)) -> Tensors {
-        let mut tensors = read(&self.path("ours.safetensors"));
-        change(&mut tensors);
-        tensors
-    }
-
-    fn import(
-        &self,
-        tensors: &Tensors,
-        options: ImportOptions,
-    ) -> Result<(Tensors, Vec<String>), WeightsError> {
-        let (from, to) = (self.path("in.safetensors"), self.path("out.safetensors"));
-        write(tensors, &from);
-        let _ = std::fs::remove_file(&to);
-        let result = import(&[from], &self.config, options, &to, &|_, _| ());
-        assert_eq!(result.is_ok(), to.exists(), "a file is left exactly if the import succeeds");
-        result.map(|report| (read(&to), report.notes))
-    }
-
-    /// The problems for which changed weights are refused.
-    fn problems(&self, change: impl FnOnce(&mut Tensors)) -> Vec<String> {
-        match self.import(&self.changed(change), OPTIONS) {
-            Err(WeightsError::Tensors { problems, .. }) => problems,
-            other => panic!("expected a list of problems, got {other:?}"),
-        }
+/// The problems for which changed weights are refused.
+fn problems(place: &Workplace, change: impl FnOnce(&mut Tensors)) -> Vec<String> {
+    match import_here(place, &changed(place, change)) {
+        Err(WeightsError::Tensors { problems, .. }) => problems,
+        other => panic!("expected a list of problems, got {other:?}"),
     }
 }
 
@@ -98,10 +74,10 @@ const QKV: &str = "dust3r.enc_blocks.1.attn.qkv.weight";
 
 #[test]
 fn the_authors_pickles_hold_what_their_safetensors_hold() {
-    let place = Workplace::new();
+    let place = place();
     let ours = place.path("imported.safetensors");
     let sources = ["stage1.pth", "stage2.pth"].map(|name| fixture("pipeline").join(name));
-    let report = import(&sources, &place.config, OPTIONS, &ours, &|_, _| ()).expect("imports");
+    let report = import(&sources, &tiny(), OPTIONS, &ours, &|_, _| ()).expect("imports");
     let imported = read(&ours);
     // The first values of each tensor.
     let direct = read(&fixture("pipeline/weights_start.safetensors"));
@@ -119,10 +95,10 @@ fn the_authors_pickles_hold_what_their_safetensors_hold() {
 
 #[test]
 fn export_gives_every_name_of_the_authors_state_dicts() {
-    let place = Workplace::new();
+    let place = place();
     let (ours, exported) = (place.path("imported.safetensors"), place.path("exported.safetensors"));
     let sources = ["stage1.pth", "stage2.pth"].map(|name| data("pipeline").join(name));
-    import(&sources, &place.config, OPTIONS, &ours, &|_, _| ()).expect("imports");
+    import(&sources, &tiny(), OPTIONS, &ours, &|_, _| ()).expect("imports");
     export(&ours, &exported, &|_, _| ()).expect("exports");
     let exported = read(&exported);
     let authors: Tensors = sources.iter().flat_map(|path| read(path)).collect();
@@ -133,7 +109,7 @@ fn export_gives_every_name_of_the_authors_state_dicts() {
 
 #[test]
 fn a_dust3r_file_gets_delta_and_side_heads_and_says_so() {
-    let place = Workplace::new();
+    let place = place();
     let (from, to) = (place.path("dust3r.safetensors"), place.path("out.safetensors"));
     let of_dust3r = |(name, tensor): (&String, &(Dtype, Vec<usize>, Vec<u8>))| {
         let bare =
@@ -145,8 +121,7 @@ fn a_dust3r_file_gets_delta_and_side_heads_and_says_so() {
     write(&dust3r, &from);
     let with = |side_heads| {
         let options = ImportOptions { fill: None, side_heads, seed: 5, float: Float::F32 };
-        let report =
-            import(std::slice::from_ref(&from), &place.config, options, &to, &|_, _| ()).expect("imports");
+        let report = import(std::slice::from_ref(&from), &tiny(), options, &to, &|_, _| ()).expect("imports");
         (read(&to), report.notes.join("\n"))
     };
     let (seeded, notes) = with(SideHeads::Seed);
@@ -168,15 +143,15 @@ fn a_dust3r_file_gets_delta_and_side_heads_and_says_so() {
 
 #[test]
 fn a_croco_file_gives_both_decoders_and_no_heads() {
-    let place = Workplace::new();
-    let croco = place.changed(|t| {
+    let place = place();
+    let croco = changed(&place, |t| {
         t.retain(|k, _| {
             k.starts_with("dust3r.") && !k.contains("dec_blocks2") && !k.contains("downstream_head")
         });
         *t = t.iter().map(|(k, v)| (k.trim_start_matches("dust3r.").to_owned(), v.clone())).collect();
         t.insert("prediction_head.bias".into(), (Dtype::F32, vec![2], vec![0; 8]));
     });
-    let (imported, notes) = place.import(&croco, OPTIONS).expect("imports");
+    let (imported, notes) = import_here(&place, &croco).expect("imports");
     let weight = |stack: &str| imported[&format!("dust3r.{stack}.2.cross_attn.projk.weight")].clone();
     assert_eq!(weight("dec_blocks"), weight("dec_blocks2"));
     let notes = notes.join("\n");
@@ -186,7 +161,7 @@ fn a_croco_file_gives_both_decoders_and_no_heads() {
 
 #[test]
 fn another_file_gives_the_tensors_that_are_in_none_of_the_first() {
-    let place = Workplace::new();
+    let place = place();
     let [part, all, to] = ["part", "ours", "to"].map(|name| place.path(&format!("{name}.safetensors")));
     let mut tensors = read(&all);
     let own = |name: &str| name.contains("enc_blocks") || name == "scale";
@@ -197,7 +172,7 @@ fn another_file_gives_the_tensors_that_are_in_none_of_the_first() {
     write(&tensors, &part);
     let with = |fill| {
         let options = ImportOptions { fill, ..OPTIONS };
-        import(std::slice::from_ref(&part), &place.config, options, &to, &|_, _| ())
+        import(std::slice::from_ref(&part), &tiny(), options, &to, &|_, _| ())
     };
     assert!(with(None).expect_err("a part").to_string().contains("missing: dust3r.dec_blocks"));
     assert!(!to.exists());
@@ -233,14 +208,14 @@ fn keys_that_are_gone_are_ignored_or_refused() {
 
 #[test]
 fn half_precision_files_load() {
-    let place = Workplace::new();
-    let bf16 = place.changed(|t| {
+    let place = place();
+    let bf16 = changed(&place, |t| {
         for (dtype, _, bytes) in t.values_mut() {
             *dtype = Dtype::BF16;
             *bytes = bytes.chunks_exact(4).flat_map(|b| [b[2], b[3]]).collect();
         }
     });
-    let (imported, _) = place.import(&bf16, OPTIONS).expect("imports");
+    let (imported, _) = import_here(&place, &bf16).expect("imports");
     for (name, (_, _, bytes)) in &imported {
         assert!(
             bytes.chunks_exact(4).zip(bf16[name].2.chunks_exact(2)).all(|(w, n)| w == [0, 0, n[0], n[1]]),
@@ -248,11 +223,11 @@ fn half_precision_files_load() {
         );
     }
     // 1.5 and −2⁻¹⁴ are exact in f16.
-    let f16 = place.changed(|t| {
+    let f16 = changed(&place, |t| {
         *t.get_mut("gs_conv.bias").expect("there") =
             (Dtype::F16, vec![14], [0x00, 0x3e, 0x00, 0x84].repeat(7));
     });
-    let (imported, _) = place.import(&f16, OPTIONS).expect("imports");
+    let (imported, _) = import_here(&place, &f16).expect("imports");
     let expected: Vec<u8> =
         [1.5_f32, -(2.0_f32.powi(-14))].repeat(7).iter().flat_map(|v| v.to_le_bytes()).collect();
     assert_eq!(imported["gs_conv.bias"].2, expected);
@@ -260,8 +235,8 @@ fn half_precision_files_load() {
 
 #[test]
 fn missing_unused_and_misshaped_tensors_are_all_named() {
-    let place = Workplace::new();
-    let problems = place.problems(|t| {
+    let place = place();
+    let problems = problems(&place, |t| {
         t.remove("dust3r.enc_norm.bias");
         t.insert("dust3r.extra".into(), (Dtype::F32, vec![1], vec![0; 4]));
         t.get_mut(QKV).expect("there").1 = vec![64, 192];
@@ -277,8 +252,8 @@ fn missing_unused_and_misshaped_tensors_are_all_named() {
 
 #[test]
 fn every_tensor_with_a_value_that_is_not_finite_is_named() {
-    let place = Workplace::new();
-    let problems = place.problems(|t| {
+    let place = place();
+    let problems = problems(&place, |t| {
         t.get_mut(QKV).expect("there").2[..4].copy_from_slice(&f32::NAN.to_le_bytes());
         t.get_mut("gs_conv.bias").expect("there").2[..4].copy_from_slice(&f32::INFINITY.to_le_bytes());
     });
@@ -305,15 +280,15 @@ fn exports_refuse_values_that_are_not_finite() {
 
 #[test]
 fn aliases_that_contradict_each_other_are_refused() {
-    let place = Workplace::new();
+    let place = place();
     let name = "dust3r.downstream_head1.dpt.scratch.layer2_rn.weight";
     let alias = "dust3r.downstream_head1.dpt.scratch.layer_rn.1.weight";
-    let agreeing = place.changed(|t| {
+    let agreeing = changed(&place, |t| {
         let value = t[name].clone();
         t.insert(alias.into(), value);
     });
-    assert!(place.import(&agreeing, OPTIONS).is_ok());
-    let problems = place.problems(|t| {
+    assert!(import_here(&place, &agreeing).is_ok());
+    let problems = problems(&place, |t| {
         let mut value = t[name].clone();
         value.2[0] ^= 1;
         t.insert(alias.into(), value);
@@ -323,20 +298,20 @@ fn aliases_that_contradict_each_other_are_refused() {
 
 #[test]
 fn only_one_name_of_an_alias_is_enough() {
-    let place = Workplace::new();
-    let renamed = place.changed(|t| {
+    let place = place();
+    let renamed = changed(&place, |t| {
         let value = t.remove("dust3r.downstream_head1.dpt.scratch.layer2_rn.weight").expect("there");
         t.insert("dust3r.downstream_head1.dpt.scratch.layer_rn.1.weight".into(), value);
     });
-    let (imported, _) = place.import(&renamed, OPTIONS).expect("imports");
+    let (imported, _) = import_here(&place, &renamed).expect("imports");
     assert_eq!(imported, read(&place.path("ours.safetensors")));
 }
 
 #[test]
 fn damaged_files_are_refused_not_misread() {
-    let place = Workplace::new();
+    let place = place();
     let path = place.path("damaged.safetensors");
-    let good = std::fs::read(place.path("ours.safetensors")).expect("read");
+    let good = place.read("ours.safetensors");
     let mut header = good.clone();
     header[0..8].copy_from_slice(&u64::MAX.to_le_bytes());
     let mut text = good.clone();

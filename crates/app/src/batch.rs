@@ -10,12 +10,12 @@ use std::time::Duration;
 
 use clap::Args;
 use snapsnap_base::file;
-use snapsnap_data::prepare::Shard;
+use snapsnap_data::Shard;
 use snapsnap_splat::scene::Kind;
 
-use crate::commands::{is_same_folder, one_of};
+use crate::arguments::one_of;
 use crate::failure::Failure;
-use crate::output::{make_folder, remove};
+use crate::output::{is_same_folder, make_folder, remove};
 use crate::progress::Progress;
 use crate::say;
 
@@ -37,19 +37,12 @@ pub struct ShardArgument {
     pub shard: Option<Shard>,
 }
 
-impl ShardArgument {
-    /// Refuses the option in a command with one input.
-    pub fn must_be_unused(&self, why: &str) -> Result<(), Failure> {
-        if self.shard.is_some() { Err(Failure::Input(format!("--shard: {why}"))) } else { Ok(()) }
-    }
-}
-
 /// The kind of the files of Gaussians.
 #[derive(Args, Default, Clone)]
 pub struct KindArgument {
     /// With many inputs: kind of the files of Gaussians [default: ply].
     #[arg(long, value_parser = one_of(KINDS))]
-    kind: Option<Kind>,
+    pub kind: Option<Kind>,
 }
 
 impl KindArgument {
@@ -57,10 +50,13 @@ impl KindArgument {
     pub fn extension(&self) -> &'static str {
         KINDS.iter().find(|(.., kind)| Some(*kind) == self.kind).map_or("ply", |(name, ..)| name)
     }
+}
 
-    /// Refuses the option in a command with one input.
-    pub fn must_be_unused(&self, why: &str) -> Result<(), Failure> {
-        if self.kind.is_some() { Err(Failure::Input(format!("--kind: {why}"))) } else { Ok(()) }
+/// Refuses options that have no effect here. `given` says for each whether it is given.
+pub fn must_be_unused(given: &[(&str, bool)], why: &str) -> Result<(), Failure> {
+    match given.iter().find(|(_, is_given)| *is_given) {
+        Some((name, _)) => Err(Failure::Input(format!("{name}: {why}"))),
+        None => Ok(()),
     }
 }
 
@@ -225,8 +221,21 @@ pub fn stem(path: &Path) -> Result<String, Failure> {
     name.ok_or_else(|| Failure::file(path, "its name is not UTF-8: rename the file"))
 }
 
+/// Extensions of pictures.
+const PICTURES: [&str; 11] =
+    ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "gif", "heic", "heif", "hif"];
+
+/// The pictures in a folder that are not hidden.
+pub fn pictures(folder: &Path) -> Result<impl Iterator<Item = PathBuf>, Failure> {
+    let is_picture = |path: &PathBuf| {
+        let extension = path.extension().map(|extension| extension.to_string_lossy().to_lowercase());
+        extension.is_some_and(|extension| PICTURES.contains(&extension.as_str()))
+    };
+    Ok(files(folder)?.into_iter().filter(is_picture))
+}
+
 /// The files in a folder that are not hidden.
-pub fn files(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
+fn files(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     let cannot = |e: std::io::Error| Failure::file(folder, format_args!("cannot read: {e}"));
     let entries = fs::read_dir(folder).map_err(cannot)?.map(|entry| entry.map(|entry| entry.path()));
     let entries = entries.collect::<Result<Vec<_>, _>>().map_err(cannot)?;

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use burn::tensor::{Device, DeviceKind, DeviceType};
 use serde::{Deserialize, Serialize};
-use snapsnap_splat::adapter;
+use snapsnap_splat::graphics_api;
 
 use crate::failure::Failure;
 use crate::memory;
@@ -28,11 +28,8 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
     }
     match kind {
         "auto" => {
-            let Some(card) = adapters().iter().find(|adapter| adapter.is_card) else {
-                return Ok(Device::flex());
-            };
-            let kind = gpus().into_iter().find(|(name, _)| *name == card.kind);
-            let card = kind.and_then(|(_, kind)| devices(kind).into_iter().nth(card.index));
+            let card = adapters().iter().find(|adapter| !adapter.software);
+            let card = card.and_then(|card| choose(&card.name).ok());
             return Ok(card.unwrap_or_else(Device::flex));
         }
         "cpu" | "flex" => return Ok(Device::flex()),
@@ -66,12 +63,11 @@ pub fn choose_in_turn(name: &str, turn: usize) -> Result<Device, Failure> {
     if memory::is_cpu(&device) || name.contains(':') {
         return Ok(device);
     }
-    let cards: Vec<&Adapter> = adapters().iter().filter(|adapter| adapter.is_card).collect();
-    let of_kind =
-        |card: &&&Adapter| if name == "auto" { card.kind == cards[0].kind } else { card.kind == name };
-    let cards: Vec<&Adapter> = cards.iter().filter(of_kind).copied().collect();
+    let cards = || adapters().iter().filter(|adapter| !adapter.software);
+    let kind = cards().next().filter(|_| name == "auto").map_or(name, |card| card.kind());
+    let cards: Vec<&Adapter> = cards().filter(|card| card.kind() == kind).collect();
     match cards.get(turn % cards.len().max(1)) {
-        Some(card) => choose(&card.device()),
+        Some(card) => choose(&card.name),
         None => Ok(device),
     }
 }
@@ -83,76 +79,42 @@ pub fn all() -> Vec<Device> {
 }
 
 /// A working device.
-pub struct Found {
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Adapter {
     /// Its name for `--device`.
     pub name: String,
     /// Name of the processor or the graphics adapter.
     pub adapter: String,
     /// Backend.
-    pub backend: &'static str,
+    pub backend: String,
     /// Whether it is a GPU made of software.
     pub software: bool,
-    /// Whether it is a GPU that `auto` takes.
-    pub card: bool,
     /// Memory in bytes, if it is known.
+    #[serde(rename = "memory_bytes")]
     pub memory: Option<u64>,
 }
 
-/// Every working device of the compiled kinds.
-pub fn found() -> Vec<Found> {
-    let processor = |name: &str, backend| Found {
-        name: name.into(),
-        adapter: processor(),
-        backend,
-        software: false,
-        card: false,
-        memory: Some(memory::there()),
-    };
-    let mut found = vec![processor("cpu", "Burn's flex"), processor("ndarray", "Burn's ndarray")];
-    found.extend(adapters().iter().map(|adapter| Found {
-        name: adapter.device(),
-        adapter: adapter.name.clone(),
-        backend: match adapter.kind.as_str() {
-            "wgpu" => "wgpu, WGSL",
-            "vulkan" => "wgpu, SPIR-V",
-            "metal" => "wgpu, MSL",
-            _ => "CUDA",
-        },
-        software: !adapter.is_card,
-        card: adapter.is_card,
-        // The graphics layer has no function for the memory of cards.
-        memory: (!adapter.is_card).then(memory::there),
-    }));
-    found
-}
-
-/// A graphics adapter that answers.
-#[derive(Debug, Serialize, Deserialize)]
-struct Adapter {
-    /// Its kind for `--device`.
-    kind: String,
-    /// Its place among the adapters of the kind.
-    index: usize,
-    name: String,
-    /// Whether it is hardware.
-    is_card: bool,
-}
-
 impl Adapter {
-    /// Its name for `--device`.
-    fn device(&self) -> String {
-        format!("{}:{}", self.kind, self.index)
+    /// Its kind for `--device`.
+    fn kind(&self) -> &str {
+        self.name.split(':').next().unwrap_or_default()
     }
 }
 
-/// The answers of the graphics drivers.
-#[derive(Debug, Default, Serialize, Deserialize)]
-struct Drivers {
-    /// All adapters of the compiled kinds.
-    adapters: Vec<Adapter>,
-    /// Whether wgpu would take OpenGL, which is not used.
-    is_opengl: bool,
+/// The devices of the processor, one of each backend.
+pub fn processors() -> [Adapter; 2] {
+    [("cpu", "Burn's flex"), ("ndarray", "Burn's ndarray")].map(|(name, backend)| Adapter {
+        name: name.into(),
+        adapter: processor(),
+        backend: backend.into(),
+        software: false,
+        memory: Some(memory::there()),
+    })
 }
+
+/// The answers of the graphics drivers: all adapters of the compiled kinds, and whether wgpu would take OpenGL, which is
+/// not used.
+type Drivers = (Vec<Adapter>, bool);
 
 /// Name of the hidden command that prints [`probe`]'s text.
 pub const PROBE: &str = "probe-adapters";
@@ -160,16 +122,23 @@ pub const PROBE: &str = "probe-adapters";
 /// The answers of the graphics drivers, as JSON.
 pub fn probe() -> String {
     let of_kind = |(kind, device_type): (&str, DeviceType)| {
+        let backend = match kind {
+            "wgpu" => "wgpu, WGSL",
+            "vulkan" => "wgpu, SPIR-V",
+            "metal" => "wgpu, MSL",
+            _ => "CUDA",
+        };
         let adapter = |(index, device): (usize, Device)| Adapter {
-            kind: kind.to_owned(),
-            index,
-            name: device.identity().map_or_else(|| "?".into(), |identity| identity.name),
-            is_card: is_card(&device),
+            name: format!("{kind}:{index}"),
+            adapter: device.identity().map_or_else(|| "?".into(), |identity| identity.name),
+            backend: backend.into(),
+            software: !is_card(&device),
+            // The graphics layer has no function for the memory of cards.
+            memory: (!is_card(&device)).then(memory::there),
         };
         devices(device_type).into_iter().enumerate().map(adapter).collect::<Vec<_>>()
     };
-    let drivers =
-        Drivers { adapters: gpus().into_iter().flat_map(of_kind).collect(), is_opengl: adapter::is_opengl() };
+    let drivers: Drivers = (gpus().into_iter().flat_map(of_kind).collect(), graphics_api::is_opengl());
     serde_json::to_string(&drivers).expect("plain text and numbers")
 }
 
@@ -186,13 +155,14 @@ fn drivers() -> &'static Drivers {
     })
 }
 
-fn adapters() -> &'static [Adapter] {
-    &drivers().adapters
+/// The graphics adapters that answer.
+pub fn adapters() -> &'static [Adapter] {
+    &drivers().0
 }
 
 /// Whether the only graphics driver is OpenGL's, which is not used.
 pub fn is_opengl() -> bool {
-    drivers().is_opengl
+    drivers().1
 }
 
 /// Kinds of devices of this build.
@@ -239,7 +209,7 @@ fn devices(kind: DeviceType) -> Vec<Device> {
     let is_wgpu = matches!(kind, DeviceType::Wgpu);
     let hook = panic::take_hook();
     panic::set_hook(Box::new(|_| {}));
-    let found = panic::catch_unwind(|| match is_wgpu && adapter::is_opengl() {
+    let found = panic::catch_unwind(|| match is_wgpu && graphics_api::is_opengl() {
         true => Vec::new(),
         false => Device::enumerate(kind).into_vec(),
     });
@@ -249,7 +219,7 @@ fn devices(kind: DeviceType) -> Vec<Device> {
 
 fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Failure> {
     let kind_name = name.split(':').next().unwrap_or(name);
-    let is_there = adapters().iter().any(|adapter| adapter.kind == kind_name);
+    let is_there = adapters().iter().any(|adapter| adapter.kind() == kind_name);
     let devices = if is_there { devices(kind) } else { Vec::new() };
     let found = devices.len();
     if found == 0 {
@@ -279,8 +249,8 @@ fn is_card(device: &Device) -> bool {
 fn unknown(name: &str, why: &str) -> Failure {
     let mut there = vec!["auto".to_owned(), "cpu (= flex)".into(), "ndarray".into()];
     there.extend(adapters().iter().map(|adapter| {
-        let software = if adapter.is_card { "" } else { ", software" };
-        format!("{} ({}{software})", adapter.device(), adapter.name)
+        let software = if adapter.software { ", software" } else { "" };
+        format!("{} ({}{software})", adapter.name, adapter.adapter)
     }));
     Failure::Input(format!("--device {name}: {why}. Available devices: {}", there.join(", ")))
 }

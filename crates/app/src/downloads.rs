@@ -1,5 +1,7 @@
 //! Files that the page offers: Gaussians, a mesh and an animation.
 
+use std::sync::{Arc, Mutex, TryLockError};
+
 use burn::tensor::Device;
 use snapsnap_mesh::export::{self, Kind as MeshKind};
 use snapsnap_mesh::fuse::fuse;
@@ -7,7 +9,9 @@ use snapsnap_splat::scene::{Kind, Stored};
 
 use crate::commands::mesh;
 use crate::failure::Failure;
+use crate::page::{self, Job, busy};
 use crate::pictures::gif;
+use crate::server::{Answer, Content, Request};
 use crate::turntable;
 
 /// A file of a scene.
@@ -46,7 +50,7 @@ impl Download {
             Self::Gaussians(kind) => Ok(stored.to_bytes(kind)?),
             Self::Mesh => {
                 let fused = fuse(&stored.load(&Device::flex()), mesh::options(MeshKind::Glb), step)?;
-                export::glb_bytes(&fused.mesh, fused.offset).map_err(|e| Failure::Internal(e.to_string()))
+                export::glb_bytes(&fused.mesh).map_err(|e| Failure::Internal(e.to_string()))
             }
             Self::Turntable => {
                 let counted = |done, all| step(&format!("{done} of {all} pictures"));
@@ -56,4 +60,29 @@ impl Download {
             }
         }
     }
+}
+
+/// Locked while a mesh or an animation is made, which takes all cores.
+static LONG: Mutex<()> = Mutex::new(());
+
+/// The answer with a file of a scene, whose name gets the file's extension. `content` makes the file's bytes. It is
+/// called with a function that tells the steps to the page.
+pub fn answer(
+    request: &Request,
+    name: &str,
+    (extension, download): (&str, Download),
+    content: impl FnOnce(&dyn Fn(&str)) -> Result<Content, Answer>,
+) -> Result<Answer, Answer> {
+    let is_long = download.is_long();
+    let content: Content = if is_long && request.method == "HEAD" {
+        Arc::new("")
+    } else {
+        let only = is_long.then(|| LONG.try_lock());
+        if matches!(only, Some(Err(TryLockError::WouldBlock))) {
+            return Err(busy());
+        }
+        let job = Job::of(request);
+        content(&|step| job.step(step))?
+    };
+    Ok(page::download(&format!("{name}.{extension}"), content))
 }

@@ -106,9 +106,7 @@ impl From<FuseError> for Failure {
             FuseError::Splat(e) => e.into(),
             FuseError::Reduce(_) => Self::Internal(e.to_string()),
             FuseError::Long(_) => Self::Input(format!("{e}; add --force to make it anyway")),
-            FuseError::Nothing(_) | FuseError::Hollow | FuseError::Coarse | FuseError::Texture(_) => {
-                Self::Input(e.to_string())
-            }
+            _ => Self::Input(e.to_string()),
         }
     }
 }

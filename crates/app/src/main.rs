@@ -1,12 +1,14 @@
 //! snapsnap turns two photographs of a person into 3D Gaussians. This crate is its command line.
 //!
 //! The other crates are libraries: [`snapsnap_net::Reconstructor`] turns photographs into Gaussians,
-//! [`snapsnap_splat::render`] is the differentiable renderer, and [`snapsnap_train::points`] has the losses of stage
-//! 1. Examples of each: `cargo run --release --example reconstruct`, `fit_gaussians` or `train_predictor`.
+//! [`snapsnap_splat::render`] is the differentiable renderer, and [`snapsnap_train::points`] has the losses of
+//! stage 1. Examples of each: `cargo run --release --example reconstruct`, `fit_gaussians` or `train_predictor`.
 // The page is part of the documentation only. A change of it does not rebuild the program.
 #![cfg_attr(doc, doc = "\n", doc = include_str!("../../../docs/architecture.md"))]
 
+mod arguments;
 mod batch;
+mod camera_options;
 mod commands;
 mod cutouts;
 mod device;
@@ -15,6 +17,7 @@ mod dump;
 mod failure;
 mod interrupt;
 mod memory;
+mod model;
 mod output;
 mod page;
 mod perceptual;
@@ -23,7 +26,6 @@ mod progress;
 mod report;
 mod say;
 mod server;
-mod told;
 mod turntable;
 mod view_folder;
 mod weights;

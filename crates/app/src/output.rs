@@ -1,10 +1,11 @@
-//! Output files and folders.
+//! Output files and folders, and checks of their paths.
 
 use std::fs;
 use std::io::{ErrorKind, Write};
-use std::path::Path;
+use std::path::{Component, Path, PathBuf};
 
-use snapsnap_base::file::write_whole;
+use snapsnap_base::file::{self, write_whole};
+use snapsnap_splat::scene::Kind;
 
 use crate::failure::Failure;
 
@@ -33,4 +34,68 @@ pub fn check_folder(path: &Path) -> Result<(), Failure> {
 /// Makes a folder and its parents unless they exist.
 pub fn make_folder(path: &Path) -> Result<(), Failure> {
     fs::create_dir_all(path).map_err(|e| Failure::file(path, format_args!("cannot make this folder: {e}")))
+}
+
+/// Refuses outputs that cannot be written, that are given twice or that are inputs.
+pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure> {
+    for (i, output) in outputs.iter().enumerate() {
+        file::check_writable(output).map_err(|e| Failure::cannot_write(output, &e))?;
+        if inputs.iter().any(|input| is_same_file(output, input)) {
+            return Err(Failure::file(output, "is an input of this command and would be overwritten"));
+        }
+        if outputs[..i].iter().any(|other| place(output) == place(other) || is_same_file(output, other)) {
+            return Err(Failure::file(output, "is given for two outputs"));
+        }
+    }
+    Ok(())
+}
+
+/// Refuses a file of Gaussians with an unknown extension. A pipe or a device without one receives a PLY.
+pub fn check_kind(path: &Path) -> Result<(), Failure> {
+    if Kind::named(path).is_some() || file::is_special(path) {
+        return Ok(());
+    }
+    Err(Failure::file(path, "is no .ply, .spz, .glb or .sog; the extension says what to write"))
+}
+
+/// Refuses an output in a data set or its source (one of `roots`): a data set would take a folder for a subject without
+/// pictures.
+pub fn outside_data<'a>(path: &Path, roots: impl IntoIterator<Item = &'a Path>) -> Result<(), Failure> {
+    let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
+    // Links of existing folders are followed. `..` after a missing folder is taken literally.
+    let mut there = PathBuf::new();
+    for part in whole.components() {
+        match part {
+            Component::ParentDir => drop(there.pop()),
+            part => there.push(part),
+        }
+        there = there.canonicalize().unwrap_or(there);
+    }
+    for root in roots {
+        let Ok(root) = root.canonicalize() else { continue };
+        // The folder of a scan contains its materials and textures.
+        let folder: &Path = if root.is_file() { root.parent().unwrap_or(&root) } else { &root };
+        if there.starts_with(folder) {
+            return Err(Failure::file(path, "lies in a data set or its source"));
+        }
+    }
+    Ok(())
+}
+
+/// The canonical path of a file, which may be missing.
+pub fn place(path: &Path) -> PathBuf {
+    let path = file::target_of(path);
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+    folder.join(path.file_name().unwrap_or_default())
+}
+
+/// Whether both paths lead to one existing folder.
+pub fn is_same_folder(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
+}
+
+/// Whether both paths lead to one existing regular file.
+pub fn is_same_file(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b && a.is_file())
 }

@@ -9,9 +9,8 @@ use snapsnap_base::file;
 use snapsnap_eval::evaluate::LeftOut;
 use snapsnap_eval::report::{Header, today};
 
-use crate::commands::check_outputs;
 use crate::failure::Failure;
-use crate::output::{self, make_folder};
+use crate::output::{self, check_outputs, make_folder};
 use crate::say;
 
 /// Files of the reports of all commands but `demo`.

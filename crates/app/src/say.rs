@@ -91,13 +91,3 @@ pub fn printable(text: &str) -> String {
     }
     printable
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn control_characters_are_escaped() {
-        assert_eq!(printable("\x1b[31mrot\r\u{9b}\n\tünd"), "\\u{1b}[31mrot\\r\\u{9b}\n\tünd");
-    }
-}

@@ -4,11 +4,10 @@ use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 use snapsnap_base::file;
-use snapsnap_splat::{Camera, cameras};
+use snapsnap_splat::{Camera, camera_file};
 
-use crate::commands::{is_same_file, place};
 use crate::failure::Failure;
-use crate::output::{check_folder, make_folder, remove};
+use crate::output::{check_folder, is_same_file, make_folder, place, remove};
 use crate::pictures::write_png;
 
 /// Name of the file of cameras.
@@ -76,7 +75,7 @@ impl ViewFolder {
         if self.keeps_cameras {
             return Ok(());
         }
-        Ok(cameras::write(views, &self.path.join(CAMERAS))?)
+        Ok(camera_file::write(views, &self.path.join(CAMERAS))?)
     }
 }
 

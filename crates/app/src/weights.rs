@@ -9,7 +9,7 @@ use snapsnap_base::{FileError, file};
 use snapsnap_net::config::Config;
 use snapsnap_net::weights::WeightFile;
 
-use crate::commands::ConfigArguments;
+use crate::arguments::ConfigArguments;
 use crate::failure::Failure;
 
 /// File name of the weights in a folder.

@@ -59,13 +59,19 @@ pub trait Schema: DeserializeOwned + Serialize {
     /// The dotted key of the first refused value, and the reason.
     fn refusal(&self) -> Option<(String, String)>;
 
+    /// Whether a key of [`Self::REMOVED`] says something else than this config does, although the value is listed: a
+    /// key that follows another one.
+    fn contradicts(&self, _key: &str, _value: &str) -> bool {
+        false
+    }
+
     /// Reads and checks a file and the files that it extends; `overrides` are `a.b=c` assignments on top.
     ///
     /// # Errors
     /// [`ConfigError`], naming file, key and allowed values.
     fn from_file(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let (table, origin) = layers::<Self>(path)?;
-        build(table, origin, overrides)
+        let (table, gone, origin) = layers::<Self>(path)?;
+        build(table, gone, origin, overrides)
     }
 
     /// Parses and checks TOML text that extends no file; `origin` names it in errors, `overrides` are `a.b=c`
@@ -74,22 +80,11 @@ pub trait Schema: DeserializeOwned + Serialize {
     /// # Errors
     /// [`ConfigError`], naming origin, key and allowed values.
     fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let (table, extended) = layer::<Self>(text, origin)?;
+        let (table, gone, extended) = layer::<Self>(text, origin)?;
         if extended.is_some() {
             return Err(syntax(origin, format!("`{EXTENDS}`: only a file can extend another")));
         }
-        build(table, origin.to_owned(), overrides)
-    }
-
-    /// The config itself, if no value is refused; `origin` names it in errors.
-    ///
-    /// # Errors
-    /// [`ConfigError::Value`].
-    fn checked(self, origin: &str) -> Result<Self, ConfigError> {
-        match self.refusal() {
-            Some((key, message)) => Err(ConfigError::Value { origin: origin.to_owned(), key, message }),
-            None => Ok(self),
-        }
+        build(table, gone, origin.to_owned(), overrides)
     }
 
     /// The config as TOML, with every key that has a value.
@@ -144,10 +139,14 @@ fn syntax(origin: &str, message: String) -> ConfigError {
     ConfigError::Syntax { origin: origin.to_owned(), message }
 }
 
-/// The merged keys of a file and of the files that it extends, and the names of all these files for errors.
-fn layers<T: Schema>(path: &Path) -> Result<(Table, String), ConfigError> {
+/// Removed keys of a config with their values.
+type Gone = BTreeMap<&'static str, String>;
+
+/// The merged keys of a file and of the files that it extends, the removed keys among them, and the names of all these
+/// files for errors.
+fn layers<T: Schema>(path: &Path) -> Result<(Table, Gone, String), ConfigError> {
     let mut chain: Vec<PathBuf> = Vec::new();
-    let mut merged = Table::new();
+    let (mut merged, mut gone) = (Table::new(), Gone::new());
     let mut next = Some(path.to_owned());
     while let Some(path) = next {
         let origin = path.display().to_string();
@@ -155,18 +154,22 @@ fn layers<T: Schema>(path: &Path) -> Result<(Table, String), ConfigError> {
             return Err(syntax(&origin, format!("more than {MAX_CHAIN} configs extend one another")));
         }
         let text = file::read_text(&path, MAX_BYTES).map_err(FileError::read(&path))?;
-        let (below, extended) = layer::<T>(&text, &origin)?;
+        let (below, further, extended) = layer::<T>(&text, &origin)?;
+        for (key, value) in further {
+            gone.entry(key).or_insert(value);
+        }
         next = extended.map(|name| path.parent().unwrap_or(Path::new("")).join(name));
         let above = std::mem::replace(&mut merged, below);
         merge(&mut merged, above);
         chain.push(path);
     }
     let names: Vec<String> = chain.iter().map(|path| path.display().to_string()).collect();
-    Ok((merged, names.join(" extending ")))
+    Ok((merged, gone, names.join(" extending ")))
 }
 
-/// The keys of one TOML text, whose names and types are checked, and the name of the file that the text extends.
-fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>), ConfigError> {
+/// The keys of one TOML text, whose names and types are checked, its removed keys, and the name of the file that it
+/// extends.
+fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Gone, Option<String>), ConfigError> {
     let mut table: Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
     let extended = match table.remove(EXTENDS) {
         None => None,
@@ -175,31 +178,27 @@ fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>),
             return Err(syntax(origin, format!("`{EXTENDS}` is a {}, must be a path", other.type_str())));
         }
     };
-    let is_older = check_names::<T>(&mut table, origin)?;
+    let gone = check_names::<T>(&mut table, origin)?;
     // serde would accept an array in place of a section.
     if let Some((key, value)) = table.iter().find(|(_, value)| !value.is_table()) {
         return Err(syntax(origin, format!("`{key}` is a {}, must be a section [{key}]", value.type_str())));
     }
-    if is_older {
+    if !gone.is_empty() {
         Value::Table(table.clone()).try_into::<T>().map_err(|e| syntax(origin, e.to_string()))?;
-        return Ok((table, extended));
+        return Ok((table, gone, extended));
     }
     // Parsed from the text, so that messages have line numbers. `extends` is blanked out; it precedes all sections.
-    let is_extends = |line: &str| line.trim_start().starts_with(EXTENDS);
-    let mut in_section = false;
-    let own: Vec<&str> = text
-        .lines()
-        .map(|line| {
-            in_section |= line.trim_start().starts_with('[');
-            if !in_section && is_extends(line) { "" } else { line }
-        })
-        .collect();
+    let mut own: Vec<&str> = text.lines().collect();
+    let first = own.iter_mut().find(|line| line.trim_start().starts_with(EXTENDS));
+    if let Some(line) = first.filter(|_| extended.is_some()) {
+        *line = "";
+    }
     toml::from_str::<T>(&own.join("\n")).map_err(|e| syntax(origin, e.to_string()))?;
-    Ok((table, extended))
+    Ok((table, gone, extended))
 }
 
-/// Refuses renamed keys and takes out removed keys; returns whether a removed key was there.
-fn check_names<T: Schema>(table: &mut Table, origin: &str) -> Result<bool, ConfigError> {
+/// Refuses renamed keys and takes out removed keys, which it returns.
+fn check_names<T: Schema>(table: &mut Table, origin: &str) -> Result<Gone, ConfigError> {
     for (old, new) in T::RENAMED {
         let (section, key) = old.rsplit_once('.').expect("a dotted key");
         let section = section.split('.').try_fold(&*table, |at, name| at.get(name)?.as_table());
@@ -207,7 +206,7 @@ fn check_names<T: Schema>(table: &mut Table, origin: &str) -> Result<bool, Confi
             return Err(syntax(origin, format!("`{old}` is now called `{new}`")));
         }
     }
-    let mut is_older = false;
+    let mut found = Gone::new();
     for (gone, values) in T::REMOVED.iter().copied().flatten() {
         let (section, key) = gone.rsplit_once('.').expect("a dotted key");
         let mut at = Some(&mut *table);
@@ -216,21 +215,23 @@ fn check_names<T: Schema>(table: &mut Table, origin: &str) -> Result<bool, Confi
         }
         match at.and_then(|at| at.remove(key)).map(|there| there.to_string()) {
             None => {}
-            Some(there) if is_gone::<T>(gone, &there) => is_older = true,
+            Some(there) if is_gone::<T>(gone, &there) => drop(found.insert(gone, there)),
             Some(there) => {
                 let message = format!("`{gone}` is gone: it is always {}, and cannot be {there}", values[0]);
                 return Err(syntax(origin, message));
             }
         }
     }
-    Ok(is_older)
+    Ok(found)
 }
 
 /// Whether `key` is in [`Schema::REMOVED`] and accepts `value` (TOML).
 pub fn is_gone<T: Schema>(key: &str, value: &str) -> bool {
     // 4 and 4.0 are the same value.
     let number = |text: &str| text.parse::<f64>().ok();
-    let is_same = |now: &&str| *now == value || number(now).is_some_and(|now| number(value) == Some(now));
+    // A recorded f32 has the digits of an f64.
+    let is_near = |now: f64| number(value).is_some_and(|value| value as f32 == now as f32);
+    let is_same = |now: &&str| *now == value || number(now).is_some_and(is_near);
     let mut all = T::REMOVED.iter().copied().flatten();
     all.any(|(gone, values)| *gone == key && (values.is_empty() || values.iter().any(is_same)))
 }
@@ -247,11 +248,16 @@ fn merge(below: &mut Table, above: Table) {
     }
 }
 
-fn build<T: Schema>(mut table: Table, origin: String, overrides: &[String]) -> Result<T, ConfigError> {
+fn build<T: Schema>(
+    mut table: Table,
+    mut gone: Gone,
+    origin: String,
+    overrides: &[String],
+) -> Result<T, ConfigError> {
     for assignment in overrides {
         let origin = format!("--set {assignment}");
         assign(&mut table, assignment).map_err(|message| syntax(&origin, message))?;
-        check_names::<T>(&mut table, &origin)?;
+        gone.extend(check_names::<T>(&mut table, &origin)?);
     }
     let origin = match overrides {
         [] => origin,
@@ -259,7 +265,14 @@ fn build<T: Schema>(mut table: Table, origin: String, overrides: &[String]) -> R
     };
     let config: T =
         Value::Table(table).try_into().map_err(|e: toml::de::Error| syntax(&origin, e.to_string()))?;
-    config.checked(&origin)
+    if let Some((key, value)) = gone.iter().find(|(key, value)| config.contradicts(key, value)) {
+        let message = format!("is gone, and {value} contradicts the key that it follows now (CHANGELOG.md)");
+        return Err(ConfigError::Value { origin, key: (*key).to_owned(), message });
+    }
+    match config.refusal() {
+        Some((key, message)) => Err(ConfigError::Value { origin, key, message }),
+        None => Ok(config),
+    }
 }
 
 /// Applies `a.b=c`: `c` is a TOML value, or a bare word for a string.

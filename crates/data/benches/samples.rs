@@ -8,7 +8,7 @@ use std::time::Instant;
 use burn::data::dataset::Dataset;
 use peak_alloc::PeakAlloc;
 use snapsnap_data::dataset::{Folder, Layout, Split};
-use snapsnap_data::prepare::{DataConfig, Subject};
+use snapsnap_data::prepare::DataConfig;
 use snapsnap_data::sample::{Augment, Loader, SampleConfig, Stage1, Stage2};
 use snapsnap_people::synth;
 
@@ -22,14 +22,10 @@ fn data_set(root: &std::path::Path, layout: Layout, resolution: u32) -> Arc<Fold
     config.views.layout = layout;
     config.views.resolution = resolution;
     config.views.samples_per_axis = 1;
-    let folder =
-        Folder::create(&root.join(format!("{layout:?}_{resolution}_24")), config.description("bench"));
-    let folder = folder.expect("makes the folder");
-    for index in 0..SUBJECTS {
-        let (subject, mesh) = (format!("{index:04}"), synth::person(&format!("bench/{index}"), None));
-        config.add(&folder, &Subject::plain(Split::Train, &subject), &mesh).expect("adds a subject");
-    }
-    Arc::new(folder)
+    let person =
+        |index: usize| (Split::Train, format!("{index:04}"), synth::person(&format!("bench/{index}"), None));
+    let root = root.join(format!("{layout:?}_{resolution}_24"));
+    config.make(&root, "bench", (0..SUBJECTS).map(person)).expect("makes the folder")
 }
 
 /// Loads `count` samples one by one. Prints rate and peak memory.

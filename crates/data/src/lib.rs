@@ -6,9 +6,11 @@ mod light;
 pub mod prepare;
 pub mod sample;
 pub mod scan;
+mod shard;
 pub mod smplx;
 #[cfg(test)]
 mod testing;
 
 pub use jitter::{Jitter, JitterConfig};
 pub use light::LightConfig;
+pub use shard::Shard;

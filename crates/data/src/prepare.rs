@@ -1,7 +1,8 @@
-//! Renders meshes as subjects of a data set: config, cameras, and shards of the work.
+//! Renders meshes as subjects of a data set: config and cameras.
 
+use std::borrow::Borrow;
 use std::path::Path;
-use std::str::FromStr;
+use std::sync::Arc;
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -13,8 +14,7 @@ use crate::dataset::{
 };
 use crate::light::LightConfig;
 use snapsnap_base::FileError;
-use snapsnap_base::config::Schema;
-use snapsnap_base::config::outside;
+use snapsnap_base::config::{Schema, outside};
 use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Renderer, ViewOptions};
@@ -187,6 +187,23 @@ impl DataConfig {
         [front, back, front.turned(90.0), front.turned(270.0)]
     }
 
+    /// Makes a data set of these people, who stand on the floor at the origin and face +z.
+    ///
+    /// # Errors
+    /// As [`Folder::create`] and [`Self::add`].
+    pub fn make<M: Borrow<Mesh>>(
+        &self,
+        root: &Path,
+        source: &str,
+        people: impl IntoIterator<Item = (Split, String, M)>,
+    ) -> Result<Arc<Folder>, FileError> {
+        let folder = Folder::create(root, self.description(source))?;
+        for (split, name, mesh) in people {
+            self.add(&folder, &Subject::plain(split, &name), mesh.borrow())?;
+        }
+        Ok(Arc::new(folder))
+    }
+
     /// Renders a subject and adds it to the data set. `mesh` stands on the floor at the origin.
     ///
     /// # Errors
@@ -226,43 +243,6 @@ impl<'a> Subject<'a> {
     /// A subject that faces +z, without a source file.
     pub fn plain(split: Split, name: &'a str) -> Self {
         Self { split, name, identity: name, yaw_degrees: 0.0, origin: Path::new(name) }
-    }
-}
-
-/// One of several machines that share the work: `i/n`, with i from 0.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Shard {
-    index: usize,
-    count: usize,
-}
-
-impl Default for Shard {
-    fn default() -> Self {
-        Self { index: 0, count: 1 }
-    }
-}
-
-impl Shard {
-    /// The shard in file names, such as `0-of-4`.
-    pub fn name(self) -> String {
-        format!("{}-of-{}", self.index, self.count)
-    }
-
-    /// Whether the subject with this index belongs to this shard.
-    pub fn has(self, place: usize) -> bool {
-        place % self.count == self.index
-    }
-}
-
-impl FromStr for Shard {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
-        match parts {
-            Some((index, count)) if index < count => Ok(Self { index, count }),
-            _ => Err(format!("`{text}` is no shard: expected i/n, with i from 0 to n − 1")),
-        }
     }
 }
 
@@ -383,16 +363,5 @@ mod tests {
         assert!(smallest > 0.55 && largest < 0.9, "{smallest} {largest}");
         let (_, farthest) = range(&mut places);
         assert!((0.05..0.2).contains(&farthest), "{farthest}");
-    }
-
-    #[test]
-    fn shards_share_the_work() {
-        let shards: Vec<Shard> = ["0/3", "1/3", "2/3"].map(|s| s.parse().expect("a shard")).to_vec();
-        for place in 0..10 {
-            assert_eq!(shards.iter().filter(|shard| shard.has(place)).count(), 1);
-        }
-        for wrong in ["", "1", "3/3", "0/0", "-1/2", "1/2/3"] {
-            assert!(wrong.parse::<Shard>().is_err(), "{wrong}");
-        }
     }
 }

@@ -363,24 +363,4 @@ mod tests {
         assert!((1.75..1.76).contains(&lowest) && (1.84..1.85).contains(&highest), "{lowest} {highest}");
         assert!(furthest > 0.09);
     }
-
-    /// A file that is cut anywhere but at its very end is refused.
-    #[test]
-    fn a_scan_that_is_cut_short_is_refused() {
-        let folder = tempfile::tempdir().expect("temporary folder");
-        let whole = folder.path().join("whole.obj");
-        snapsnap_mesh::export::write_obj(crate::testing::person(), &whole).expect("writes");
-        let bytes = fs::read(&whole).expect("reads");
-        let path = folder.path().join("cut.obj");
-        for percent in [1, 20, 40, 50, 60, 70, 80, 90, 95] {
-            // A cut at the end of a line leaves no broken line behind.
-            let end = bytes.len() * percent / 100;
-            let end = bytes[..end].iter().rposition(|b| *b == b'\n').map_or(0, |at| at + 1);
-            fs::write(&path, &bytes[..end]).expect("writes");
-            let refused = import::read(&path).map(|_| ()).expect_err("cut").to_string();
-            let expected = ["there is no triangle", "the file seems to be cut short"];
-            assert!(expected.iter().any(|words| refused.contains(words)), "{percent} %: {refused}");
-        }
-        assert!(import::read(&whole).is_ok());
-    }
 }

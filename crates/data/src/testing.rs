@@ -6,7 +6,7 @@ use glam::Vec3;
 use tempfile::TempDir;
 
 use crate::dataset::{Folder, Layout, Split};
-use crate::prepare::{DataConfig, Subject};
+use crate::prepare::DataConfig;
 use crate::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
 use snapsnap_people::synth;
@@ -83,10 +83,7 @@ pub fn data_set(
 pub fn made(config: &DataConfig, mesh: &Mesh, subjects: usize) -> (TempDir, Arc<Folder>) {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let root = temporary.path().join(format!("people_{}_{}", config.views.resolution, config.views.count));
-    let folder = Folder::create(&root, config.description("a test")).expect("makes the folder");
-    for subject in 0..subjects {
-        let name = format!("{subject:04}");
-        config.add(&folder, &Subject::plain(Split::Train, &name), mesh).expect("adds a subject");
-    }
-    (temporary, Arc::new(folder))
+    let people = (0..subjects).map(|subject| (Split::Train, format!("{subject:04}"), mesh));
+    let folder = config.make(&root, "a test", people).expect("makes the folder");
+    (temporary, folder)
 }

@@ -1,7 +1,6 @@
 //! Metrics of pictures and surfaces, the evaluation of a model on a data set, error against run time, numerical
 //! stability.
 
-pub mod baselines;
 pub mod bench;
 mod error;
 pub mod evaluate;

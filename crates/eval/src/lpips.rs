@@ -81,11 +81,15 @@ impl Lpips {
     pub fn load(files: &[PathBuf], device: &Device) -> Result<Self, WeightsError> {
         let sources = files.iter().map(|path| Source::open(path)).collect::<Result<Vec<_>, _>>()?;
         let wanted: Vec<_> = LAYERS.iter().enumerate().flat_map(Layer::tensors).collect();
-        let (mut holders, mut problems) = (Vec::new(), Vec::new());
+        let (mut tensors, mut problems) = (Vec::new(), Vec::new());
         for (name, shape) in &wanted {
             let found: Vec<_> = sources.iter().filter_map(|s| Some((s, s.tensors().get(name)?))).collect();
             match found.as_slice() {
-                [(source, entry)] if entry.shape == *shape => holders.push(*source),
+                [(source, entry)] if entry.shape == *shape => {
+                    let values = source.read_f32(name)?;
+                    problems.extend(not_finite(name, &values));
+                    tensors.push(TensorData::new(values, shape.clone()));
+                }
                 [(_, entry)] => {
                     problems.push(format!("mis-shaped: {name} {:?} instead of {shape:?}", entry.shape));
                 }
@@ -93,22 +97,12 @@ impl Lpips {
                 _ => problems.push(format!("given twice: {name}")),
             }
         }
-        if !problems.is_empty() {
-            return Err(refused(files, problems));
-        }
         let is_unknown = |name: &&String| {
             !name.starts_with("classifier.") && wanted.iter().all(|(known, _)| known != *name)
         };
-        if let Some(name) = sources.iter().flat_map(|source| source.tensors().keys()).find(is_unknown) {
-            let problem = format!("not part of AlexNet or LPIPS: {}", name.escape_debug());
-            return Err(refused(files, vec![problem]));
-        }
-        let mut tensors = Vec::new();
-        for ((name, shape), source) in wanted.into_iter().zip(holders) {
-            let values = source.read_f32(&name)?;
-            problems.extend(not_finite(&name, &values));
-            tensors.push(TensorData::new(values, shape));
-        }
+        let unknown = sources.iter().flat_map(|source| source.tensors().keys()).find(is_unknown);
+        let of_other = |name: &String| format!("not part of AlexNet or LPIPS: {}", name.escape_debug());
+        problems.extend(unknown.map(of_other));
         if !problems.is_empty() {
             return Err(refused(files, problems));
         }
@@ -240,8 +234,11 @@ mod tests {
     use std::collections::HashMap;
     use std::path::Path;
 
-    use burn::tensor::FloatDType;
-    use snapsnap_net::weights::write_tensors;
+    use snapsnap_net::weights::{Float, write_tensors};
+
+    use crate::pictures::Picture;
+    use crate::region::Region;
+    use crate::score::Score;
 
     fn values(stream: u32, count: usize, value: impl Fn(f64) -> f64) -> Vec<f32> {
         (0..count).map(|place| value(number(stream, place)) as f32).collect()
@@ -267,7 +264,7 @@ mod tests {
         let path = folder.join(name);
         let names = tensors.iter().map(|(name, shape, _)| (name.clone(), shape.clone())).collect();
         let values = |i: usize| Ok(tensors[i].2.clone());
-        write_tensors(&path, name, HashMap::new(), names, values, &|_, _| ()).expect("writes");
+        write_tensors(&path, name, HashMap::new(), names, Float::F32, values, &|_, _| ()).expect("writes");
         path
     }
 
@@ -306,26 +303,32 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_is_that_of_finite_differences_in_f64() {
-        const STEP: f64 = 1e-6;
-        let device = Device::flex().autodiff();
+    fn scores_have_the_distance() {
+        const SIZE: [usize; 2] = [48, 40];
         let folder = tempfile::tempdir().expect("a folder");
         let file = written(folder.path(), &tensors(), "all");
-        let mut lpips = Lpips::load(&[file], &Device::flex()).expect("loads").to_device(&device);
-        for layer in &mut lpips.layers {
-            layer.weight = layer.weight.clone().cast(FloatDType::F64);
-            layer.bias = layer.bias.clone().cast(FloatDType::F64);
-            layer.linear = layer.linear.clone().cast(FloatDType::F64);
-        }
-        let [a, b, along] = [7, 8, 9].map(|stream| picture(stream, [48, 40], &device).cast(FloatDType::F64));
-        let a = a.detach().require_grad();
-        let distance = |x: Tensor<4>| lpips.distance(x, b.clone());
-        let gradient = a.grad(&distance(a.clone()).sum().backward()).expect("tracked");
-        let host = |x: Tensor<1>| x.into_scalar::<f64>();
-        let got = host((gradient * along.clone().inner()).sum());
-        let at = |t: f64| host(distance(a.clone().detach() + along.clone() * t));
-        let expected = (at(STEP) - at(-STEP)) / (2.0 * STEP);
-        assert!((got - expected).abs() < 1e-6 * expected.abs(), "{got}, not {expected}");
+        let lpips = Lpips::load(&[file], &Device::flex()).expect("loads");
+        let noise = |stream| Picture::new(values(stream, 3 * SIZE[0] * SIZE[1], |u| u), SIZE, "picture");
+        let [a, b] = [100, 101].map(|stream| noise(stream).expect("a picture"));
+        let score = Score::new(&a, &b, &Region::all(&b), Some(&lpips)).expect("one size");
+        let [x, y] = [100, 101].map(|stream| picture(stream, SIZE, &Device::flex()));
+        let whole = f64::from(lpips.distance(x, y).into_scalar::<f32>());
+        assert_eq!(score.lpips, Some(whole));
+    }
+
+    #[test]
+    fn weights_that_are_not_the_published_ones_are_no_lpips() {
+        let folder = tempfile::tempdir().expect("a folder");
+        assert_eq!(Lpips::missing(folder.path()), PUBLISHED.map(|name| folder.path().join(name)));
+        // Files with the published names and other contents.
+        let (network, learned) = tensors().into_iter().partition::<Vec<_>, _>(|t| t.0.starts_with('f'));
+        written(folder.path(), &network, PUBLISHED[0]);
+        written(folder.path(), &learned, PUBLISHED[1]);
+        assert_eq!(Lpips::missing(folder.path()), Vec::<PathBuf>::new());
+        let said = Lpips::published(folder.path(), &Device::flex()).expect_err("other weights").to_string();
+        assert!(said.contains("the distance of the check pictures is"), "{said}");
+        std::fs::write(folder.path().join(PUBLISHED[1]), []).expect("writes");
+        Lpips::published(folder.path(), &Device::flex()).expect_err("an empty file");
     }
 
     #[test]

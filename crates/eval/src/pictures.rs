@@ -22,7 +22,7 @@ impl Picture {
     /// Red, green and blue planes `[3, H, W]`; `what` names them in errors.
     ///
     /// # Errors
-    /// [`EvalError::Value`] for a value that is not finite or not in [0, 1].
+    /// [`EvalError::Message`] for a value that is not finite or not in [0, 1].
     ///
     /// # Panics
     /// If the number of values does not fit the size.
@@ -31,7 +31,10 @@ impl Picture {
         if let Some(at) = values.iter().position(|v| !(0.0..=1.0).contains(v)) {
             let (row, column) = (at / width % height, at % width);
             let channel = at / (height * width);
-            return Err(EvalError::Value { what, value: values[at], channel, row, column });
+            return Err(EvalError::Message(format!(
+                "value {} at channel {channel}, row {row}, column {column} of the {what}: must be 0 to 1",
+                values[at]
+            )));
         }
         Ok(Self { width, height, values })
     }
@@ -39,7 +42,7 @@ impl Picture {
     /// A render `[H, W, 3]`, clamped to [0, 1] and shrunk by `times`: each pixel is the mean of `times`² pixels.
     ///
     /// # Errors
-    /// [`EvalError::Value`] for a value that is not finite.
+    /// [`EvalError::Message`] for a value that is not finite.
     ///
     /// # Panics
     /// If the number of values does not fit the size, or if the size is no multiple of `times`.
@@ -66,7 +69,7 @@ impl Picture {
     /// The picture of a decoded file. Alpha is blended over black, the background of the protocols.
     ///
     /// # Errors
-    /// [`EvalError::Value`] for files of floating-point numbers with other values.
+    /// [`EvalError::Message`] for files of floating-point numbers with other values.
     pub fn from_file(picture: DynamicImage, what: &'static str) -> Result<Self, EvalError> {
         let (width, height) = (picture.width() as usize, picture.height() as usize);
         // Without alpha every pixel has an alpha of 1.

@@ -32,12 +32,14 @@ impl Region {
     /// all ground-truth pixels that are not black, then moved into the picture. Wider people are cut off.
     ///
     /// # Errors
-    /// [`EvalError::Empty`] for a black picture.
+    /// [`EvalError::Message`] for a black picture.
     pub fn paper(target: &Picture) -> Result<Self, EvalError> {
         let Picture { width, height, .. } = *target;
         let seen = |i: usize| (0..3).any(|c| target.plane(c)[i] != 0.0);
         let Some([left, top, right, bottom]) = bounds(width, height, seen) else {
-            return Err(EvalError::Empty("the true picture is black throughout: there is no person".into()));
+            return Err(EvalError::Message(
+                "the true picture is black throughout: there is no person".into(),
+            ));
         };
         let side = |of: usize, most: usize| ((of * height + AT / 2) / AT).clamp(1, most);
         let [h, w] = [side(PAPER[0], height), side(PAPER[1], width)];
@@ -51,11 +53,11 @@ impl Region {
     /// The person's mask `[H, W]` (any value above 0) with `margin` pixels around it.
     ///
     /// # Errors
-    /// [`EvalError::Empty`] for a mask without a person.
+    /// [`EvalError::Message`] for a mask without a person.
     pub fn masked(mask: &[f32], [height, width]: [usize; 2], margin: usize) -> Result<Self, EvalError> {
         let inside = dilated(&mask.iter().map(|v| *v > 0.0).collect::<Vec<_>>(), width, margin);
         let Some([left, top, right, bottom]) = bounds(width, height, |i| inside[i]) else {
-            return Err(EvalError::Empty("the mask is empty: there is no person".into()));
+            return Err(EvalError::Message("the mask is empty: there is no person".into()));
         };
         let window = [left, top, right + 1 - left, bottom + 1 - top];
         let line = |row: usize| &inside[row * width + left..row * width + right + 1];

@@ -28,7 +28,7 @@ impl Score {
     /// a mask. The box of a mask that is smaller than [`MIN_SIDE`] is padded with black.
     ///
     /// # Errors
-    /// [`EvalError::Sizes`].
+    /// [`EvalError::Message`] if the sizes differ.
     pub fn new(
         image: &Picture,
         target: &Picture,

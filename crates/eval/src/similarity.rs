@@ -30,7 +30,7 @@ impl SquaredError {
     /// Adds the differences of two pictures in a region.
     ///
     /// # Errors
-    /// [`EvalError::Sizes`].
+    /// [`EvalError::Message`] if the sizes differ.
     pub fn add(&mut self, image: &Picture, target: &Picture, region: &Region) -> Result<(), EvalError> {
         check_sizes(image, target)?;
         let [x, y, width, height] = region.window;
@@ -53,7 +53,7 @@ impl SquaredError {
 /// pictures.
 ///
 /// # Errors
-/// [`EvalError::Sizes`].
+/// [`EvalError::Message`] if the sizes differ.
 pub fn psnr(image: &Picture, target: &Picture, region: &Region) -> Result<f64, EvalError> {
     let mut error = SquaredError::default();
     error.add(image, target, region)?;
@@ -63,13 +63,13 @@ pub fn psnr(image: &Picture, target: &Picture, region: &Region) -> Result<f64, E
 /// Checks that two pictures have one size.
 ///
 /// # Errors
-/// [`EvalError::Sizes`].
+/// [`EvalError::Message`] if the sizes differ.
 pub fn check_sizes(image: &Picture, target: &Picture) -> Result<(), EvalError> {
-    let size = |p: &Picture| vec![p.height, p.width];
+    let size = |p: &Picture| format!("{}×{}", p.width, p.height);
     if size(image) == size(target) {
         return Ok(());
     }
-    Err(EvalError::Sizes { found: size(image), expected: size(target) })
+    Err(EvalError::Message(format!("the sizes differ: {} and {}", size(image), size(target))))
 }
 
 /// Structural similarity as scikit-image's `structural_similarity` computes it by default for values in [0, 1]:
@@ -78,7 +78,7 @@ pub fn check_sizes(image: &Picture, target: &Picture) -> Result<(), EvalError> {
 /// extend beyond the mask. `None` if no pixel is left.
 ///
 /// # Errors
-/// [`EvalError::Sizes`].
+/// [`EvalError::Message`] if the sizes differ.
 pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option<f64>, EvalError> {
     check_sizes(image, target)?;
     let [x, y, w, h] = region.window;
@@ -99,7 +99,7 @@ pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option
 /// [`ssim_gaussian`] of two pictures, computed in f64, mean over the pixels of a region and the channels.
 ///
 /// # Errors
-/// [`EvalError::Sizes`].
+/// [`EvalError::Message`] if the sizes differ.
 pub fn ssim_of_loss(image: &Picture, target: &Picture, region: &Region) -> Result<f64, EvalError> {
     check_sizes(image, target)?;
     let window = Window { weights: gaussian(), correction: 1.0, padded: true };

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
-use snapsnap_data::sample::Handling;
-use snapsnap_net::config::PrecisionChoice;
+use snapsnap_data::sample::PhotographChanges;
+use snapsnap_net::config::Precision;
 use snapsnap_splat::Preset;
 
 /// A section `[ablations.NAME]` of an evaluation, or `[model]` or `[settings.NAME]` of a benchmark. Unset keys have
@@ -21,8 +21,8 @@ pub struct Variant {
     pub set: Vec<String>,
     /// Device, as in `--device`.
     pub device: Option<String>,
-    /// Precision of the point predictor. Unset: `auto`.
-    pub precision: Option<PrecisionChoice>,
+    /// Precision of the point predictor. Unset: the weights' own on a CPU with instructions for bf16, else f32.
+    pub precision: Option<Precision>,
     /// Whether the unseen sides are predicted. Unset: only with two photographs.
     pub sides: Option<bool>,
     /// Whether pixels of the unseen sides get the colours of the nearest photographed points.
@@ -49,20 +49,8 @@ pub struct Variant {
     pub only: Option<Vec<String>>,
     /// Benchmarks: input views, as in `views.inputs` of an evaluation.
     pub inputs: Option<Vec<usize>>,
-    /// Benchmarks: the parameters of the Gaussians that are fitted to the photographs afterwards.
-    pub tune: Option<Tune>,
     /// Changes to the photographs.
-    pub photographs: Option<Handling>,
-}
-
-/// Parameters that are fitted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Tune {
-    /// Every parameter.
-    All,
-    /// Colours alone.
-    Colors,
+    pub photographs: Option<PhotographChanges>,
 }
 
 impl Variant {
@@ -88,7 +76,7 @@ impl Variant {
 
     /// The first key with an invalid value, and the reason.
     pub(crate) fn refusal(&self) -> Option<(&'static str, String)> {
-        let photographs = self.photographs.as_ref().and_then(Handling::problem);
+        let photographs = self.photographs.as_ref().and_then(PhotographChanges::problem);
         let must = |is_wrong: bool, range: &str| is_wrong.then(|| format!("must be {range}"));
         let problems = [
             ("photographs", photographs.map(|(key, message)| format!("`{key}` {message}"))),
@@ -102,18 +90,8 @@ impl Variant {
 
     /// The first key that is set and that only benchmarks have.
     pub(crate) fn key_of_benchmarks(&self) -> Option<&'static str> {
-        const KEYS: [&str; 10] = [
-            "knob",
-            "supersampling",
-            "preset",
-            "antialiased",
-            "scene",
-            "omits",
-            "data",
-            "only",
-            "inputs",
-            "tune",
-        ];
+        const KEYS: [&str; 9] =
+            ["knob", "supersampling", "preset", "antialiased", "scene", "omits", "data", "only", "inputs"];
         let keys = self.keys();
         KEYS.into_iter().find(|key| keys.contains_key(*key))
     }

@@ -1,5 +1,6 @@
 //! Textured triangle meshes, of scans and synthetic people.
 
+use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::sync::Arc;
 
@@ -9,7 +10,7 @@ use image::RgbImage;
 /// A triangle mesh. [`Mesh::check`] refuses indices out of range and numbers that are not finite.
 #[derive(Debug, Clone, Default)]
 pub struct Mesh {
-    /// Positions, y up: metres from the world's origin, if its maker says nothing else.
+    /// Positions, y up, in metres from the world's origin unless the maker of the mesh says otherwise.
     pub positions: Vec<Vec3>,
     /// Colour of each position in [0, 1]; empty where materials give the colour.
     pub colors: Vec<Vec3>,
@@ -32,7 +33,7 @@ pub struct Face {
     pub material: u32,
 }
 
-/// Reflection of light: colour times texture times the positions' colours.
+/// Reflectance of a surface: `color` times texture times vertex colour.
 #[derive(Debug, Clone)]
 pub struct Material {
     /// Diffuse colour in [0, 1].
@@ -105,8 +106,7 @@ impl Mesh {
         Ok(())
     }
 
-    /// Smooth normals: at each position the mean of its faces' normals, weighted by their area. Zero at positions without
-    /// a face.
+    /// Vertex normals: the area-weighted mean of the adjacent faces' normals. Zero at positions without a face.
     pub fn normals(&self) -> Vec<Vec3> {
         let mut normals = vec![Vec3::ZERO; self.positions.len()];
         for face in &self.faces {
@@ -119,8 +119,8 @@ impl Mesh {
         normals.into_iter().map(Vec3::normalize_or_zero).collect()
     }
 
-    /// Merges positions that are equal in place and colour. Files repeat positions along the seams of textures, where
-    /// shading would show an edge. Returns the former row of each position.
+    /// Merges vertices with equal position and colour. Files duplicate vertices along texture seams, where smooth
+    /// shading would otherwise show an edge. Returns the former index of each vertex.
     pub fn weld(&mut self) -> Vec<usize> {
         let bits = |v: Vec3| v.to_array().map(|x| if x == 0.0 { 0 } else { x.to_bits() });
         let mut rows = HashMap::with_capacity(self.positions.len());
@@ -144,9 +144,47 @@ impl Mesh {
 
     /// Smallest and largest coordinates of the positions.
     pub fn bounds(&self) -> (Vec3, Vec3) {
-        let start = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        self.positions.iter().fold(start, |(low, high), p| (low.min(*p), high.max(*p)))
+        bounds(self.positions.iter().copied())
     }
+}
+
+/// Smallest and largest coordinates; infinite without points.
+pub fn bounds(points: impl Iterator<Item = Vec3>) -> (Vec3, Vec3) {
+    points.fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)))
+}
+
+/// A colour as bytes. Values outside of [0, 1] are clamped.
+pub fn bytes(color: Vec3) -> [u8; 3] {
+    color.to_array().map(|c| (255.0 * c).round() as u8)
+}
+
+/// For each face the number of its connected piece. Faces that share one of the `positions` are connected. Piece 0 has
+/// the most faces, and so on. Faces have at least one corner.
+pub fn pieces<'a>(positions: usize, faces: impl Iterator<Item = &'a [u32]> + Clone) -> Vec<usize> {
+    fn root(parents: &mut [usize], mut row: usize) -> usize {
+        while parents[row] != row {
+            parents[row] = parents[parents[row]];
+            row = parents[row];
+        }
+        row
+    }
+    let mut parents: Vec<usize> = (0..positions).collect();
+    for face in faces.clone() {
+        let first = root(&mut parents, face[0] as usize);
+        for corner in &face[1..] {
+            let other = root(&mut parents, *corner as usize);
+            parents[other] = first;
+        }
+    }
+    let roots: Vec<usize> = faces.map(|face| root(&mut parents, face[0] as usize)).collect();
+    let mut sizes = vec![0_usize; positions];
+    roots.iter().for_each(|root| sizes[*root] += 1);
+    let mut order: Vec<usize> = (0..positions).filter(|row| sizes[*row] > 0).collect();
+    // The sort is stable: of two pieces of one size, the piece with the smaller root is the first.
+    order.sort_by_key(|row| Reverse(sizes[*row]));
+    let mut numbers = vec![0; positions];
+    order.into_iter().enumerate().for_each(|(number, root)| numbers[root] = number);
+    roots.into_iter().map(|root| numbers[root]).collect()
 }
 
 #[cfg(test)]
@@ -183,6 +221,12 @@ mod tests {
         assert_eq!(mesh.positions.len(), 4);
         assert_eq!(mesh.faces[1].positions, [1, 3, 2]);
         assert_eq!(mesh.check(), Ok(()));
+    }
+
+    #[test]
+    fn pieces_are_numbered_from_the_largest_on() {
+        let faces: [&[u32]; 4] = [&[0, 1, 2], &[3, 4, 5], &[5, 6, 7, 8], &[9, 10, 11]];
+        assert_eq!(pieces(12, faces.into_iter()), [1, 0, 0, 2]);
     }
 
     #[test]

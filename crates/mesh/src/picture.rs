@@ -12,8 +12,8 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
 
 use snapsnap_base::{FileError, file, guarded};
 
-/// Bytes that a decoded photograph, mask or view may take: 201 million pixels of red, green, blue and alpha, the most that
-/// telephones take. The steps after decoding need about twice as much again.
+/// Memory limit of a decoded photograph, mask or view in bytes: 201 million RGBA pixels, the largest picture that
+/// phones take. The steps after decoding need about twice as much again.
 pub const MAX_BYTES: u64 = 768 << 20;
 /// Largest picture file that is read into memory before it is decoded.
 const MAX_FILE: u64 = 1 << 30;
@@ -21,8 +21,8 @@ const MAX_FILE: u64 = 1 << 30;
 /// The picture in `path`, turned upright according to its EXIF data.
 ///
 /// # Errors
-/// [`FileError`] for a file that cannot be read, is no picture, is damaged or cut short, or would take more than `most`
-/// bytes in memory, which is checked before the picture is decoded.
+/// [`FileError`] for a file that cannot be read, is no picture, is damaged or cut short, or would take more than
+/// `most` bytes in memory. The size is checked before decoding.
 pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
     let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
     guarded(path, || decode_from(path, file, most))
@@ -37,7 +37,7 @@ pub fn size(path: &Path) -> Result<[u32; 2], FileError> {
     guarded(path, || size_from(path, file))
 }
 
-/// Width and height of the picture in `bytes`, which are a part of `path`.
+/// Width and height of the picture in `bytes`. Errors name `path`, the file that contains it.
 ///
 /// # Errors
 /// As [`size`].
@@ -54,7 +54,7 @@ fn size_from(path: &Path, mut source: impl BufRead + Seek) -> Result<[u32; 2], F
     size.map(Into::into).map_err(unreadable(path))
 }
 
-/// The picture in `bytes`, which are a part of `path`.
+/// The picture in `bytes`. Errors name `path`, the file that contains it.
 ///
 /// # Errors
 /// As [`decode`].
@@ -62,12 +62,12 @@ pub fn decode_bytes(path: &Path, bytes: &[u8], most: u64) -> Result<DynamicImage
     guarded(path, || decode_from(path, Cursor::new(bytes), most))
 }
 
-/// For `map_err`: the error of a damaged image, or one of an unknown format, in `path`.
+/// For `map_err`: the error for an image in `path` that is damaged or of an unknown format.
 pub fn unreadable(path: &Path) -> impl Fn(ImageError) -> FileError {
     move |source| FileError::unsuitable(path, format!("not a readable image: {source}"))
 }
 
-/// The first bytes of a file, which are read again.
+/// The first bytes of a file, without consuming them.
 fn start<'a>(path: &Path, source: &'a mut impl BufRead) -> Result<&'a [u8], FileError> {
     source.fill_buf().map_err(FileError::read(path))
 }
@@ -82,7 +82,7 @@ fn whole(path: &Path, source: impl Read) -> Result<Vec<u8>, FileError> {
 fn decode_from(path: &Path, mut source: impl BufRead + Seek, most: u64) -> Result<DynamicImage, FileError> {
     let failed = unreadable(path);
     let check = |[width, height]: [u32; 2], stored: u64| {
-        // Every picture becomes red, green and blue.
+        // Every picture is converted to 8-bit RGB later.
         let bytes = stored.max(3 * u64::from(width) * u64::from(height));
         if bytes <= most {
             return Ok(());

@@ -1,10 +1,10 @@
 //! Views of a mesh: colour, coverage and depth by a z-buffer rasteriser.
 //!
-//! * A pixel's coverage is the share of its samples, on a regular grid, that lie inside a triangle. Triangles with a common
-//!   edge have no common sample and leave none out, because vertices are rounded to whole numbers (1/240 pixel) and edges
-//!   follow the top-left rule.
-//! * A pixel's colour is the coverage-weighted mean of its visible surfaces, over black. Each surface is shaded once per
-//!   pixel, at the middle of its samples, with textures filtered to the pixel's size.
+//! * A pixel's coverage is the share of its samples, on a regular grid, that lie inside a triangle. Triangles with a
+//!   common edge neither share nor miss a sample, because vertices are rounded to 1/240 pixel and edges follow the
+//!   top-left rule.
+//! * A pixel's colour is the coverage-weighted mean of its visible surfaces, over black. Each surface is shaded once
+//!   per pixel, at the middle of its samples, with textures filtered to the pixel's size.
 //! * Depth is exact: the ray through the pixel's centre (at +½) meets the plane of the nearest triangle there.
 
 mod light;
@@ -28,11 +28,11 @@ use shade::{Lit, Pyramid, Shader};
 const SUBPIXELS: i64 = 240;
 /// Rows of pixels in a band; bands are drawn in parallel.
 const BAND: usize = 8;
-/// Least depth of a vertex in metres. Triangles with a nearer one are left out, not clipped.
+/// Near plane in metres. Triangles with a nearer vertex are left out, not clipped.
 const NEAR: f64 = 1e-3;
-/// Largest pixel coordinate of a vertex. Triangles with a larger one are left out.
+/// Largest pixel coordinate of a vertex. Triangles with a vertex beyond it are left out.
 const FAR_OUTSIDE: f64 = 1e6;
-/// Least distance between two surfaces along a ray, metres, for the second one to be another.
+/// Smallest distance along a ray between two surfaces that count as separate, metres.
 const LEAST_GAP: f64 = 0.004;
 /// No triangle.
 const NONE: u32 = u32::MAX;
@@ -44,7 +44,7 @@ pub struct ViewOptions {
     pub samples: usize,
     /// Light of the scene.
     pub light: Light,
-    /// Whether [`View::second`] is made.
+    /// Whether [`View::second`] is rendered.
     pub second: bool,
 }
 
@@ -61,14 +61,14 @@ pub struct View {
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// `[H,W]` red, green, blue in [0, 1] over black, that is multiplied by `alpha`.
+    /// `[H,W]` red, green, blue in [0, 1], premultiplied by `alpha`.
     pub color: Vec<[f32; 3]>,
     /// `[H,W]` coverage in [0, 1].
     pub alpha: Vec<f32>,
     /// `[H,W]` metres along the optical axis at the pixel's centre; 0 without a surface there.
     pub depth: Vec<f32>,
-    /// `[H,W]` depth of the second surface that faces the camera: the first one behind the place where the pixel's ray
-    /// leaves the body, as a flank behind an arm. 0 without one, and empty unless [`ViewOptions::second`].
+    /// `[H,W]` depth of the second surface that faces the camera, such as a flank behind an arm: the first front face
+    /// behind the point where the ray leaves the body. 0 without one. Empty unless [`ViewOptions::second`].
     pub second: Vec<f32>,
 }
 
@@ -82,7 +82,7 @@ struct Triangle {
     columns: [usize; 2],
     rows: [usize; 2],
     face: u32,
-    /// Whether its outer side is visible.
+    /// Whether the triangle faces the camera.
     is_front: bool,
 }
 
@@ -144,7 +144,8 @@ impl<'a> Renderer<'a> {
             Light::Plain(lights) => Lit::Plain(lights),
             Light::Around(surroundings) => Lit::Vertices(self.occlusion().light(surroundings, &self.normals)),
         };
-        let shader = Shader { renderer: self, camera, corners: &corners, light };
+        let Self { mesh, normals, textures, .. } = self;
+        let shader = Shader { mesh, normals, textures, camera, corners: &corners, light };
         let pixels = width * height;
         let mut view = View {
             width,
@@ -157,7 +158,7 @@ impl<'a> Renderer<'a> {
         let colors = view.color.par_chunks_mut(BAND * width);
         let coverages = view.alpha.par_chunks_mut(BAND * width);
         let depths = view.depth.par_chunks_mut(BAND * width);
-        // Rows of no pixels, if the second surface is not wanted.
+        // Empty rows if the second surface is not wanted.
         let mut seconds: Vec<&mut [f32]> = match options.second {
             true => view.second.chunks_mut(BAND * width).collect(),
             false => lists.iter().map(|_| Default::default()).collect(),
@@ -185,7 +186,7 @@ impl<'a> Renderer<'a> {
     }
 }
 
-/// The triangle on the screen; `None` for an invisible one.
+/// Projects a triangle; `None` if it is invisible.
 fn triangle(corners: [DVec3; 3], face: usize, camera: &Camera) -> Option<Triangle> {
     if corners.iter().any(|c| c.z < NEAR) {
         return None;
@@ -225,24 +226,24 @@ fn triangle(corners: [DVec3; 3], face: usize, camera: &Camera) -> Option<Triangl
     Some(Triangle { corners: rounded, plane, columns, rows, face: face as u32, is_front: distance < 0.0 })
 }
 
-/// Places of the samples within a pixel, in 1/[`SUBPIXELS`]. The last is the centre, which counts only for depth.
+/// Positions of the samples within a pixel, in 1/[`SUBPIXELS`]. The last one is the centre, used only for depth.
 fn places(samples: usize) -> Vec<[i64; 2]> {
     let place = |i: usize| (2 * i as i64 + 1) * SUBPIXELS / (2 * samples as i64);
     let grid = (0..samples * samples).map(|i| [place(i % samples), place(i / samples)]);
     grid.chain([[SUBPIXELS / 2; 2]]).collect()
 }
 
-/// Samples of a band's pixels between the first and the last column that triangles may touch.
+/// Z-buffer of a band, from the first to the last column that triangles may touch.
 struct Band {
     /// First column.
     left: usize,
     columns: usize,
-    /// For each pixel and place: 1/z of the nearest triangle, and its index.
+    /// For each pixel and sample: 1/z of the nearest triangle, and its index.
     nearest: Vec<(f64, u32)>,
 }
 
 impl Band {
-    /// Samples of the rows from `rows[0]` to before `rows[1]`; `None` where `list` has no triangle.
+    /// Rasterises the triangles of `list` in the rows `rows[0]..rows[1]`; `None` if `list` is empty.
     fn new(list: &[u32], triangles: &[Triangle], rows: [usize; 2], places: &[[i64; 2]]) -> Option<Self> {
         let columns = || list.iter().map(|index| triangles[*index as usize].columns);
         let left = columns().map(|[first, _]| first).min()?;
@@ -253,7 +254,7 @@ impl Band {
         Some(band)
     }
 
-    /// Marks the samples inside the triangle to which it is the nearest so far.
+    /// Depth test of the samples inside a triangle.
     fn add(&mut self, index: u32, t: &Triangle, rows: [usize; 2], places: &[[i64; 2]]) {
         let (left, columns) = (self.left, self.columns);
         t.samples(rows, places, |x, y, place, inverse_depth| {
@@ -265,17 +266,17 @@ impl Band {
         });
     }
 
-    /// Writes the depths of [`View::second`] in the rows of the band, pictures of this width.
+    /// Writes [`View::second`] of the band's rows to `to`, whose rows have `width` pixels.
     fn second(&self, list: &[u32], triangles: &[Triangle], rows: [usize; 2], width: usize, to: &mut [f32]) {
         let per_pixel = self.nearest.len() / ((rows[1] - rows[0]) * self.columns);
         let centres = self.nearest.iter().skip(per_pixel - 1).step_by(per_pixel);
-        // The nearest triangle of one side that lies behind the given depths (their inverses).
+        // A step of depth peeling: 1/z of the nearest front or back faces behind `limits` (inverse depths).
         let behind = |limits: &[f64], is_front: bool| {
             let mut found = vec![0.0_f64; limits.len()];
             for t in list.iter().map(|index| &triangles[*index as usize]).filter(|t| t.is_front == is_front) {
                 t.samples(rows, &[[SUBPIXELS / 2; 2]], |x, y, _, inverse_depth| {
                     let pixel = (y - rows[0]) * self.columns + x - self.left;
-                    // A depth of 0 has no inverse: there is nothing to lie behind.
+                    // A limit of 0 means no surface.
                     let is_behind =
                         limits[pixel] > 0.0 && 1.0 / inverse_depth > 1.0 / limits[pixel] + LEAST_GAP;
                     if is_behind && inverse_depth > found[pixel] {
@@ -297,10 +298,10 @@ impl Band {
 }
 
 impl Triangle {
-    /// Calls `each` for the samples inside the triangle in the rows from `rows[0]` to before `rows[1]`: column, row, place
-    /// in the pixel, and 1/z.
+    /// Calls `each` with column, row, sample and 1/z of the samples inside the triangle in the rows
+    /// `rows[0]..rows[1]`.
     fn samples(&self, rows: [usize; 2], places: &[[i64; 2]], mut each: impl FnMut(usize, usize, usize, f64)) {
-        // Edge function of edge i at (x, y), minus one where points on the edge belong to the neighbour: inside is ≥ 0.
+        // Coefficients of edge function i: inside is ≥ 0. Minus one where points on the edge belong to the neighbour.
         let edges: [[i64; 3]; 3] = std::array::from_fn(|i| {
             let (from, to) = (self.corners[i], self.corners[(i + 1) % 3]);
             let [dx, dy] = [to[0] - from[0], to[1] - from[1]];

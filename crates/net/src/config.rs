@@ -9,17 +9,22 @@ use serde::{Deserialize, Serialize};
 pub use snapsnap_base::config::{ConfigError, Schema};
 
 pub use modes::{
-    Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, Precision, PrecisionChoice, RegressorColor,
-    RegressorStart, RotationFrame, Sides, Upsample, WorldFrame,
+    Anchor, Body, ConfMode, Downsample, Fusion, HeadKind, Precision, RegressorStart, RotationFrame, Sides,
+    Upsample, WorldFrame,
 };
 
-/// Largest distance, in pixels, of an input pixel that influences an output pixel of the regressor, statistics aside. It is
-/// the reach of the 3×3 convolutions on the longest path: 14 at full size, 12 at half size (·2), 14 at a quarter (·4), and
-/// up to 3 more because an enlarged pixel lies beside its source. Rounded up to a multiple of 4.
+/// Receptive radius of the regressor in pixels, group-norm statistics aside: the sum over the 3×3 convolutions of the
+/// longest path, 14 at full size, 12 at half size (·2), 14 at a quarter (·4), and up to 3 more because an enlarged
+/// pixel lies beside its source. Rounded up to a multiple of 4.
 pub const RECEPTIVE_RADIUS: usize = 100;
 
-/// `network.pair_degrees` of a front and a back.
+/// `network.pair_degrees` of a front and a back photograph.
 pub const OPPOSITE: f64 = 180.0;
+
+const HULL_REACH: f64 = 0.05;
+/// Half of the range from black to white.
+const COLOR_LIMITS: [f64; 2] = [0.5; 2];
+const LEAST_OPACITIES: [f64; 2] = [0.0; 2];
 
 /// The config of the networks.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -37,9 +42,9 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NetworkConfig {
-    /// Network between photographs and raw points. A `convolution` uses these sizes: those of the encoder for its coarsest
-    /// level, those of the decoder for the sides, `mlp_ratio`, `patch` (8 or 16), `rope_base`, `layer_dims` for the channels at
-    /// 1, 2, 4 and 8 times the finest pixel, and `last_dim`.
+    /// Network between photographs and raw points. A `convolution` uses `enc_*` for the attention at its coarsest
+    /// level, `dec_*` for the attention of the sides, `layer_dims` for the channels of its four levels (pixels of 1,
+    /// 2, 4 and 8 times the finest size), `patch` (8 or 16) and `last_dim`.
     pub body: Body,
     /// Channels of an encoder token.
     pub enc_dim: usize,
@@ -53,12 +58,8 @@ pub struct NetworkConfig {
     pub dec_depth: usize,
     /// Attention heads of a decoder block.
     pub dec_heads: usize,
-    /// Hidden channels of a block's MLP, as a multiple of its token channels.
-    pub mlp_ratio: usize,
     /// Side of a square patch in pixels.
     pub patch: usize,
-    /// Base of the rotary position embedding.
-    pub rope_base: f64,
     /// Channels of the four DPT branches.
     #[serde(deserialize_with = "snapsnap_base::config::four")]
     pub layer_dims: [usize; 4],
@@ -66,31 +67,31 @@ pub struct NetworkConfig {
     pub feature_dim: usize,
     /// Channels before the last DPT convolution.
     pub last_dim: usize,
-    /// Token maps that feed the DPT branches: 0 is the encoder's output, l the l-th decoder layer's.
+    /// Token maps that feed the DPT branches: 0 is the encoder's output, l the output of the l-th decoder layer.
     #[serde(deserialize_with = "snapsnap_base::config::four")]
     pub hooks: [usize; 4],
     /// Kind of head.
     pub head: HeadKind,
     /// Whether the right and left heads exist; without them only the two photographed sides are predicted.
     pub side_heads: bool,
-    /// Origin of the maps of the unseen sides.
+    /// How the maps of the unseen sides are made.
     pub sides: Sides,
-    /// Channels of the network of completed sides at 1, 2, 4 and 8 times the finest pixel.
+    /// Channels of the completion network's four levels (pixels of 1, 2, 4 and 8 times the finest size).
     #[serde(deserialize_with = "snapsnap_base::config::four")]
     pub side_dims: [usize; 4],
-    /// Whether completed sides have the second surface that faces their cameras, too, such as the flank behind an arm.
+    /// Whether completed sides also have the second surface that faces their camera, such as the flank behind an arm.
     pub second_layer: bool,
-    /// Fusion of the tokens of the two photographs into those of the unseen sides.
+    /// Fusion of the photographs' tokens into the tokens of the unseen sides.
     pub fusion: Fusion,
     /// Activation of the confidence channel.
     pub conf_mode: ConfMode,
-    /// Side of the square canvas in pixels, of points and Gaussians.
+    /// Side of the square canvas in pixels: the resolution of point maps and Gaussians.
     pub resolution: usize,
     /// Side of the square image that the point predictor receives, in pixels.
     pub net_resolution: usize,
-    /// A side pixel becomes a Gaussian where its confidence exceeds this.
+    /// A side pixel becomes a Gaussian where its confidence exceeds this value.
     pub conf_threshold: f32,
-    /// Enlargement of points and confidences from `net_resolution` to `resolution`; unset: as in `mode.compat`.
+    /// Enlargement of points and confidences from `net_resolution` to `resolution`; unset: follows `mode.compat`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub upsample: Option<Upsample>,
     /// Initial value of δ, the learned global scale of the points (metres per network unit).
@@ -104,7 +105,7 @@ pub struct NetworkConfig {
     pub mask_channel: bool,
     /// Whether the predictor receives the direction of each pixel's ray in two channels.
     pub ray_channels: bool,
-    /// Whether the back photograph is mirrored, so that both show a limb at the same place.
+    /// Whether the back photograph is mirrored, so that both photographs show a limb at the same place.
     pub mirror: bool,
     /// Precision in which the weights were trained. A training writes it, and a reconstruction uses the same.
     #[serde(skip_serializing_if = "Precision::is_f32")]
@@ -113,19 +114,19 @@ pub struct NetworkConfig {
     pub both_ways: bool,
     /// Whether the photographs' points are moved onto the rays of their pixels.
     pub on_rays: bool,
-    /// Largest distance, in pixels of a canvas of 1024, of a point of an unseen side from the photographs' silhouettes. Points
-    /// beyond are left out. Unset: all points are kept.
+    /// Margin around the photographs' silhouettes, in pixels of a canvas of 1024. Points of an unseen side that
+    /// project outside of the grown silhouettes are left out. Unset: all points are kept.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hull_margin: Option<usize>,
-    /// Largest way in metres by which a point of an unseen side moves along its line of sight, away from its camera, until it lies
-    /// inside both silhouettes. Unset: 0.05 with [`Self::hull_margin`], else 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub hull_reach: Option<f64>,
-    /// Whether Gaussians close the top of head and shoulders between front and back, where there are sides.
+    /// Largest distance in metres by which a point of an unseen side moves along its line of sight, away from the
+    /// side's camera, to lie inside both silhouettes. In force only with [`Self::hull_margin`].
+    #[serde(skip_serializing_if = "is_hull_reach")]
+    pub hull_reach: f64,
+    /// Whether Gaussians close the top of head and shoulders between front and back. Needs sides.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub closed_top: bool,
-    /// Degrees that the camera of the second photograph stands around the person from the first one's, counter-clockwise as seen from
-    /// above. 180: front and back. Others are for scenes of several known cameras, and have no unseen sides.
+    /// Angle around the person from the first camera to the second, in degrees, counter-clockwise as seen from above.
+    /// 180: front and back. Other angles are for scenes of several known cameras, without unseen sides.
     #[serde(skip_serializing_if = "is_opposite")]
     pub pair_degrees: f64,
 }
@@ -140,9 +141,7 @@ impl Default for NetworkConfig {
             dec_dim: 768,
             dec_depth: 12,
             dec_heads: 12,
-            mlp_ratio: 4,
             patch: 16,
-            rope_base: 100.0,
             layer_dims: [96, 192, 384, 768],
             feature_dim: 256,
             last_dim: 128,
@@ -168,7 +167,7 @@ impl Default for NetworkConfig {
             both_ways: false,
             on_rays: false,
             hull_margin: None,
-            hull_reach: None,
+            hull_reach: HULL_REACH,
             closed_top: false,
             pair_degrees: OPPOSITE,
         }
@@ -179,15 +178,27 @@ fn is_opposite(degrees: &f64) -> bool {
     *degrees == OPPOSITE
 }
 
+fn is_hull_reach(reach: &f64) -> bool {
+    *reach == HULL_REACH
+}
+
+fn are_color_limits(limits: &[f64; 2]) -> bool {
+    *limits == COLOR_LIMITS
+}
+
+fn are_least_opacities(least: &[f64; 2]) -> bool {
+    *least == LEAST_OPACITIES
+}
+
 impl NetworkConfig {
     /// Channels of a photograph for the network: colours, and the channels that the config adds.
     pub fn input_channels(&self) -> usize {
         3 + usize::from(self.mask_channel) + 2 * usize::from(self.ray_channels)
     }
 
-    /// Largest way in metres by which a point of an unseen side moves into the silhouettes.
+    /// Largest distance in metres by which a point of an unseen side moves into the silhouettes.
     pub fn hull_reach(&self) -> f64 {
-        self.hull_reach.unwrap_or(if self.hull_margin.is_some() { 0.05 } else { 0.0 })
+        if self.hull_margin.is_some() { self.hull_reach } else { 0.0 }
     }
 
     /// Channels of the four token maps that feed the DPT branches.
@@ -202,56 +213,31 @@ impl NetworkConfig {
 pub struct RegressorConfig {
     /// 1: one network for all views; 2: one for front and back, one for the sides (the paper's ablation).
     pub networks: usize,
-    /// Channels of every UNet stage.
-    pub channels: usize,
-    /// Groups of every group normalisation.
-    pub groups: usize,
-    /// Start of the network's output; unset: as published.
+    /// Reference of the network's output and source of the colours; unset: as published.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<RegressorStart>,
-    /// Source of a Gaussian's colour; unset: the pixel with a geometric start, else the network.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub color: Option<RegressorColor>,
-    /// Largest corrections of the colours of photographed pixels and of the pixels of unseen sides, as shares of the range from
-    /// black to white. Unset: half of the range.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub color_limits: Option<[f64; 2]>,
-    /// Least opacities of the Gaussians of photographed pixels and of the pixels of unseen sides. Unset: 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub least_opacities: Option<[f64; 2]>,
-    /// With `mode.crop`, pixels around the person's box that the network receives; unset: all that influence the person's
-    /// pixels. Training and inference should use the same value.
+    /// Largest colour corrections, for pixels of the photographs and of the unseen sides, as shares of the range from
+    /// black to white.
+    #[serde(skip_serializing_if = "are_color_limits")]
+    pub color_limits: [f64; 2],
+    /// Least opacities, for Gaussians of the photographs and of the unseen sides.
+    #[serde(skip_serializing_if = "are_least_opacities")]
+    pub least_opacities: [f64; 2],
+    /// With `mode.crop`, margin in pixels around the person's box that the network receives; unset: the receptive
+    /// radius. Training and inference should use the same value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub margin: Option<usize>,
 }
 
 impl RegressorConfig {
-    /// Pixels around the person's box.
+    /// Margin in pixels around the person's box.
     pub fn margin(&self) -> usize {
         self.margin.unwrap_or(RECEPTIVE_RADIUS)
     }
 
-    /// Start of the network's output.
+    /// Reference of the network's output.
     pub fn start(&self) -> RegressorStart {
         self.start.unwrap_or(RegressorStart::Published)
-    }
-
-    /// Largest corrections of colours of photographs and of unseen sides, as shares of the range from black to white.
-    pub fn color_limits(&self) -> [f64; 2] {
-        self.color_limits.unwrap_or([0.5; 2])
-    }
-
-    /// Least opacities of the Gaussians of photographs and of unseen sides.
-    pub fn least_opacities(&self) -> [f64; 2] {
-        self.least_opacities.unwrap_or([0.0; 2])
-    }
-
-    /// Source of a Gaussian's colour.
-    pub fn color(&self) -> RegressorColor {
-        self.color.unwrap_or(match self.start() {
-            RegressorStart::Published => RegressorColor::Free,
-            RegressorStart::Geometric => RegressorColor::Residual,
-        })
     }
 }
 
@@ -259,18 +245,15 @@ impl Default for RegressorConfig {
     fn default() -> Self {
         Self {
             networks: 1,
-            channels: 16,
-            groups: 16,
             start: None,
-            color: None,
-            color_limits: None,
-            least_opacities: None,
+            color_limits: COLOR_LIMITS,
+            least_opacities: LEAST_OPACITIES,
             margin: None,
         }
     }
 }
 
-/// Quirk or fix, one key each. An unset key follows `compat`; a key that contradicts `compat = true` is refused.
+/// The published code's quirks and their fixes. An unset key follows `compat`; a key that contradicts it is refused.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ModeConfig {
@@ -295,14 +278,11 @@ pub struct ModeConfig {
 }
 
 impl Config {
-    /// The same config with all keys set that follow another key if unset, such as those of `mode.compat`.
+    /// The same config with every key set that otherwise follows another key, such as `mode.compat`.
     pub fn resolved(&self) -> Self {
         let mut config = self.clone();
         config.network.upsample = Some(self.upsample());
-        config.network.hull_reach =
-            self.network.hull_reach.or(self.network.hull_margin.map(|_| self.network.hull_reach()));
         config.regressor.start = Some(self.regressor.start());
-        config.regressor.color = Some(self.regressor.color());
         config.regressor.margin = self.crop().then(|| self.regressor.margin());
         config.mode = ModeConfig {
             compat: self.mode.compat,
@@ -320,7 +300,7 @@ impl Config {
         self.network.resolution / self.network.net_resolution
     }
 
-    /// The value in force of a key of the modes: of the published code with `mode.compat`, else the corrected one.
+    /// The value of a mode: `key` if set, else `published` with `mode.compat`, else `corrected`.
     fn mode<T>(&self, key: Option<T>, published: T, corrected: T) -> T {
         key.unwrap_or(if self.mode.compat { published } else { corrected })
     }
@@ -350,8 +330,8 @@ impl Config {
         self.mode(self.mode.crop, false, true)
     }
 
-    /// Height to which the person is scaled, in pixels of a canvas of 1024: that of the training subjects, which cover
-    /// rows 124 to 863, or the published demo's (docs/method.md, "Photographs on the canvas").
+    /// Height to which the person is scaled, in pixels of a canvas of 1024: 739 as for the training subjects, which
+    /// cover rows 124 to 863, or 700 as in the published demo (docs/method.md, "Photographs on the canvas").
     pub fn person_height(&self) -> usize {
         self.mode(self.mode.person_height, 700, 739)
     }

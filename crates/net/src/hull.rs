@@ -4,24 +4,23 @@ use glam::DVec3;
 use rayon::prelude::*;
 use snapsnap_splat::Camera;
 
-use crate::chosen::pixel_width;
 use crate::config::{NetworkConfig, OPPOSITE};
-use crate::network::{View, nominal_camera};
+use crate::network::{View, nominal_camera, pixel_width};
 
-/// Most steps of a point on its way into the silhouettes, which bounds the time on large canvases.
+/// Largest number of steps of a point towards the silhouettes, which bounds the time on large canvases.
 const MOST_STEPS: f64 = 100.0;
 
 /// The space inside the masks of the two photographs.
 pub struct Hull {
     side: usize,
-    /// Masks, grown.
+    /// Dilated masks.
     masks: [Vec<bool>; 2],
     cameras: [Camera; 2],
 }
 
 impl Hull {
-    /// The hull of masks `[S, S]` of the front and the back, each grown by `margin` pixels, since predicted points have small
-    /// errors. The cameras are the nominal ones: upright people are seen by exactly these (docs/method.md, "Upright targets").
+    /// The hull of masks `[S, S]` of front and back, dilated by `margin` pixels for small errors of predicted points.
+    /// The nominal cameras are the cameras that see upright people (docs/method.md, "Upright targets").
     pub fn new(masks: [&[bool]; 2], side: usize, margin: usize) -> Self {
         let cameras = [View::Front, View::Back].map(|view| nominal_camera(view, OPPOSITE, side));
         Self { side, masks: masks.map(|mask| dilated(mask, side, margin)), cameras }
@@ -39,8 +38,8 @@ impl Hull {
         })
     }
 
-    /// The first place inside the hull on the way of a point outside of it, straight away from `centre` by at most `reach`, all in
-    /// metres in the front camera's frame. `None` for a point inside, and if the way does not lead inside.
+    /// The first place inside the hull when a point moves straight away from `centre`, by at most `reach`; all in
+    /// metres in the front camera's frame. `None` for a point inside, and if no place in reach is inside.
     fn entered(&self, point: [f32; 3], centre: DVec3, reach: f64) -> Option<[f32; 3]> {
         if self.contains(point) {
             return None;
@@ -54,10 +53,10 @@ impl Hull {
     }
 }
 
-/// Moves the points of the sides that lie outside of the photographs' silhouettes along their lines of sight until they are inside
-/// (docs/method.md, "Points inside the silhouettes"). `masks` `[S, S]` are those of the photographs, `points`
-/// `[V, S, S, 3]` in metres in the front camera's frame, and `conf` `[V, S, S]` the confidences: pixels that become no Gaussians stay.
-/// Returns the number of points that moved.
+/// Moves the sides' points that lie outside of the photographs' silhouettes along their lines of sight until they are
+/// inside (docs/method.md, "Points inside the silhouettes"). `masks` `[S, S]` belong to the photographs. `points`
+/// `[V, S, S, 3]` are metres in the front camera's frame. Points with a confidence `conf` `[V, S, S]` too low for a
+/// Gaussian stay. Returns the number of points that moved.
 pub(crate) fn carve(config: &NetworkConfig, masks: [&[bool]; 2], points: &mut [f32], conf: &[f32]) -> usize {
     let (side, area) = (config.resolution, config.resolution * config.resolution);
     let reach = config.hull_reach();
@@ -91,12 +90,12 @@ pub fn dilated(mask: &[bool], width: usize, margin: usize) -> Vec<bool> {
     spread(&across, [width, rows], [1, width], margin)
 }
 
-/// Set pixels reach `margin` further along lines of `length` pixels; lines and pixels lie `strides` apart.
+/// Dilates by `margin` along lines of `length` pixels. Lines and pixels lie `strides` apart.
 fn spread(inside: &[bool], [lines, length]: [usize; 2], strides: [usize; 2], margin: usize) -> Vec<bool> {
     let mut out = vec![false; inside.len()];
     for line in 0..lines {
         let at = |i: usize| line * strides[0] + i * strides[1];
-        // One past the last pixel that the last set one reaches.
+        // One past the last pixel that the set pixels before `next` reach.
         let mut reach = 0;
         let mut next = 0;
         for i in 0..length {
@@ -117,8 +116,7 @@ mod tests {
     use super::*;
     use crate::network::nominal_camera;
 
-    /// The person is the left half of the front photograph, hence x < 0. The right's camera stands at x = +2, also for the second
-    /// surfaces.
+    /// The person is the left half of the front photograph (x < 0). The camera of both right surfaces is at x = +2.
     #[test]
     fn points_of_sides_move_along_their_lines_of_sight_into_the_silhouettes() {
         let (side, area) = (64, 64 * 64);
@@ -129,7 +127,7 @@ mod tests {
         let outside = [0.1, 0.2, 2.1];
         let far = [0.5, 0.2, 2.1];
         let inside = [-0.1, 0.2, 2.1];
-        // Of each view: outside, inside, too far outside, not finite, and outside of low confidence.
+        // Points of each view: outside, inside, too far outside, not finite, and outside with low confidence.
         let mut given = vec![0.0; 6 * 3 * area];
         let mut conf = vec![0.0; 6 * area];
         for view in 0..6 {
@@ -145,9 +143,9 @@ mod tests {
         let bits = |points: &[f32]| points.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
         assert_eq!(carved(&config).1, 0, "without hull_margin");
         config.hull_margin = Some(8);
-        config.hull_reach = Some(0.0);
+        config.hull_reach = 0.0;
         assert_eq!(carved(&config).1, 0);
-        config.hull_reach = Some(0.2);
+        config.hull_reach = 0.2;
         let (points, count) = carved(&config);
         // The left's camera looks towards +x: its points only move further outside.
         assert_eq!(count, 2);
@@ -162,7 +160,7 @@ mod tests {
         expected[at..at + 3].copy_from_slice(&moved);
         expected[second..second + 3].copy_from_slice(&moved);
         assert_eq!(bits(&points), bits(&expected), "nothing else moves");
-        config.hull_reach = None;
+        config.hull_reach = 0.05;
         let (points, count) = carved(&config);
         assert!(count == 0 && bits(&points) == bits(&given), "the way into the half is longer than 0.05 m");
     }

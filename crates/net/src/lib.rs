@@ -1,13 +1,13 @@
-//! The networks of snapsnap: two photographs → point maps → Gaussians, and the files their weights come from.
+//! The networks of snapsnap (two photographs → point maps → Gaussians) and their weight files.
 
-mod chosen;
+mod closed_top;
 pub mod config;
-mod crop;
-pub mod gaussians;
 mod hull;
 mod memory;
-pub mod names;
+mod nearest_colors;
 pub mod network;
+pub mod painter;
+mod parameters;
 mod photograph;
 mod points;
 pub mod precision;
@@ -15,15 +15,15 @@ mod predict;
 mod reconstruct;
 pub mod regressor;
 pub mod resample;
-pub mod sides;
 pub mod steps;
-mod top;
 pub mod u2net;
+mod valid_pixels;
 pub mod weights;
+mod window;
 
-pub use crop::Window;
 pub use hull::dilated;
 pub use photograph::Photograph;
 pub use points::Points;
 pub use predict::Prediction;
 pub use reconstruct::{Reconstruction, Reconstructor, placed};
+pub use window::Window;

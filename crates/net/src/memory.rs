@@ -1,21 +1,21 @@
-//! How much memory a reconstruction takes on a CPU, known from its config before it starts.
+//! Estimate of a reconstruction's memory on a CPU, from its config.
 
 use crate::config::Config;
 
 /// Bytes of an f32.
 const F32: u64 = 4;
-/// Bytes per pixel of the canvas for a person of the training subjects' height, with unseen sides: photographs, point maps on the device and on the host, side images, the regressor's planes of 16 channels and the
-/// Gaussians; measured (docs/inference.md). Twice as much is needed if every pixel of every view becomes a Gaussian.
+/// Bytes per canvas pixel, measured for a person of the training subjects' height with sides (docs/inference.md): all
+/// images and maps on device and host. A Gaussian in every pixel of every view needs twice as much.
 const PER_PIXEL: u64 = 500;
 /// Memory that depends neither on size nor on weights: code, buffers of the threads.
 const BASE: u64 = 200 << 20;
 
 impl Config {
-    /// Bytes that [`crate::Reconstructor::reconstruct`] needs for a standing person, with weights of this number of parameters.
+    /// Bytes that [`crate::Reconstructor::reconstruct`] needs for a standing person and so many `parameters`.
     pub fn memory_needed(&self, parameters: u64) -> u64 {
         let n = &self.network;
         let area = |side: usize| (side as u64).saturating_mul(side as u64);
-        // A head's maps at half the network's resolution and at all of it.
+        // A head's maps at half and at full resolution of the network.
         let head = area(n.net_resolution).saturating_mul(F32 * n.feature_dim as u64);
         // Second surfaces are two more views.
         let per_pixel = if n.second_layer { PER_PIXEL * 3 / 2 } else { PER_PIXEL };

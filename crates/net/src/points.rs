@@ -12,14 +12,14 @@ use crate::network::{PointMap, View};
 pub struct Points {
     /// `[V, S, S, 3]` metres, front camera's frame; tracked if the predictor is trained.
     pub maps: Tensor<4>,
-    /// The same values.
+    /// The values of `maps`.
     pub host: Vec<f32>,
     /// Confidences `[V, S, S]`.
     pub conf: Vec<f32>,
 }
 
 impl Points {
-    /// The points of maps on the whole canvas, one batch entry.
+    /// Joins the maps of all views on the whole canvas, a batch of one.
     pub fn new(maps: Vec<(View, PointMap)>) -> Self {
         let (points, conf): (Vec<_>, Vec<_>) =
             maps.into_iter().map(|(_, map)| (map.points, map.conf)).unzip();
@@ -27,9 +27,9 @@ impl Points {
         Self { host: host(maps.clone()), conf: host(Tensor::cat(conf, 0)), maps }
     }
 
-    /// Moves points of the sides into the silhouettes of photographs with these masks `[S, S]`, and brings the maps to `device`. Tracked
-    /// maps keep their gradients. Other maps lose values that are not finite: one would spoil the normalisation of a whole view.
-    /// Returns the number of points that moved.
+    /// Moves points of the sides into the photographs' silhouettes, by their masks `[S, S]`, and brings the maps to
+    /// `device`. Tracked maps keep their gradients. In other maps, values that are not finite become 0, since one of
+    /// them would spoil the normalisation of a whole view. Returns the number of points that moved.
     pub(crate) fn carve(&mut self, config: &NetworkConfig, masks: [&[bool]; 2], device: &Device) -> usize {
         let is_tracked = self.maps.device().is_autodiff();
         let before = if is_tracked { self.host.clone() } else { Vec::new() };
@@ -49,9 +49,9 @@ impl Points {
     }
 }
 
-/// Points `[V,S,S,3]` whose values `before` have become those of `now`; their gradient stays.
+/// Changes points `[V,S,S,3]` from the values `before` to the values `now`. Gradients pass unchanged.
 fn shifted(points: Tensor<4>, before: &[f32], now: &[f32]) -> Tensor<4> {
-    // The difference of values that are not finite, which do not change, would be NaN.
+    // Values that are not finite do not change; their difference would be NaN.
     let shift = |(before, now): (&f32, &f32)| if now.is_finite() { now - before } else { 0.0 };
     let shifts: Vec<f32> = before.iter().zip(now).map(shift).collect();
     let shifts = TensorData::new(shifts, points.dims());

@@ -2,19 +2,26 @@
 //! regressor, whose input is coordinates, stay in f32.
 //!
 //! On a GPU the layers' tensors are of 16 bits. On the CPU they are f32, and kernels round the factors of products
-//! ([`snapsnap_ops::half`]).
+//! ([`snapsnap_ops::bf16`]).
 
 use burn::module::Param;
 use burn::tensor::{Device, FloatDType, Tensor};
 
 use crate::config::Config;
-pub use crate::config::{Precision, PrecisionChoice};
-use crate::names::{NamedMapper, ParameterPath, map_named};
+pub use crate::config::Precision;
 use crate::network::PointPredictor;
+use crate::parameters::{NamedMapper, ParameterPath, map_named};
 
 impl Precision {
-    /// The predictor in this precision. Gradients reach the given predictor. Norms, δ and the last layers of the heads stay
-    /// in f32.
+    /// The precision of a reconstruction for which none is asked: the training's on a CPU with instructions for bf16,
+    /// f32 elsewhere.
+    pub fn of_weights(config: &Config, device: &Device) -> Self {
+        let is_fast = *device == Device::flex() && cpu_has_bf16();
+        if is_fast { config.network.precision } else { Self::F32 }
+    }
+
+    /// The predictor in this precision. Norms, δ and the last layers of the heads stay in f32. Gradients reach the
+    /// given predictor.
     pub fn lower(self, predictor: PointPredictor) -> PointPredictor {
         if self == Self::F32 {
             return predictor;
@@ -26,20 +33,12 @@ impl Precision {
 
 /// Whether this processor has instructions for products in bf16.
 pub fn cpu_has_bf16() -> bool {
-    snapsnap_ops::half::is_there()
-}
-
-impl PrecisionChoice {
-    /// The precision of a reconstruction: with `auto`, that of the weights' training on a CPU that has bf16, else f32.
-    pub fn of_weights(self, config: &Config, device: &Device) -> Precision {
-        let is_fast = *device == Device::flex() && cpu_has_bf16();
-        self.fixed().unwrap_or(if is_fast { config.network.precision } else { Precision::F32 })
-    }
+    snapsnap_ops::bf16::is_there()
 }
 
 struct Lower {
     dtype: FloatDType,
-    /// Whether the layer of a name gives raw points, which stay in f32: bf16 rounds points at 2 m by a centimetre.
+    /// Whether the named layer outputs raw points. It stays in f32: bf16 rounds points at 2 m by a centimetre.
     is_last: fn(&str) -> bool,
 }
 

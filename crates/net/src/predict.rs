@@ -5,10 +5,10 @@ use rayon::prelude::*;
 use snapsnap_ops::has_kernels;
 
 use crate::config::{Config, NetworkConfig};
-use crate::crop::Window;
 use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::photograph::Photograph;
 use crate::steps::{Record, Step};
+use crate::window::Window;
 
 /// Point maps of all views on the predictor's window of the canvas.
 #[derive(Debug, Clone)]
@@ -40,7 +40,7 @@ impl Prediction {
         Self::new(predictor, config, images, &masks, window, record)
     }
 
-    /// Predicted point maps of front and back `[B,2,3,S,S]` in [−1, 1], with the masks `[B,2,S,S]`, in a window of the canvas.
+    /// Predicted point maps of fronts and backs `[B,2,3,S,S]` in [−1, 1] with masks `[B,2,S,S]`, in a window.
     pub fn new(
         predictor: &PointPredictor,
         config: &Config,
@@ -62,7 +62,7 @@ impl Prediction {
             canvas: side,
             size: [width, height],
             downsample: config.downsample(),
-            tokens: input.grid.tokens(),
+            tokens: input.grid.iter().product(),
             channels,
         });
         let images = input.images.clone();

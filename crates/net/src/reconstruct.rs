@@ -1,4 +1,4 @@
-//! The networks of a weight file: two photographs on their canvases → Gaussians in the front camera's frame (docs/method.md).
+//! Two photographs on their canvases → Gaussians in the front camera's frame (docs/method.md).
 
 use std::time::Duration;
 
@@ -6,8 +6,8 @@ use burn::tensor::Device;
 use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, RotationFrame, WorldFrame};
-use crate::gaussians::{Origin, Painted, Painter};
 use crate::network::{PointPredictor, View};
+use crate::painter::{Origin, Painted, Painter};
 use crate::photograph::Photograph;
 use crate::points::Points;
 use crate::precision::Precision;
@@ -26,7 +26,7 @@ pub struct Reconstruction {
     pub valid: Vec<Vec<bool>>,
     /// Pseudo images of the sides' maps `[3, S, S]` in [−1, 1], −1 where there is no point.
     pub side_images: Vec<Vec<f32>>,
-    /// The Gaussians, view after view, row-major, in the front camera's frame; then those that close the top.
+    /// View after view, row-major, in the front camera's frame; then the Gaussians that close the top.
     pub gaussians: Gaussians,
     /// The pixel of each Gaussian.
     pub origins: Vec<Origin>,
@@ -34,7 +34,7 @@ pub struct Reconstruction {
     pub lost: usize,
     /// Steps that ran, and steps that were left out, with reasons.
     pub steps: Vec<Step>,
-    /// Time per module, the device synchronised before and after each.
+    /// Time per module, with the device synchronised before and after each.
     pub times: Vec<(&'static str, Duration)>,
 }
 
@@ -55,7 +55,7 @@ impl Reconstruction {
     }
 }
 
-/// Gaussians of the front camera's frame in the frame that `camera_to_world` leads to.
+/// Moves Gaussians from the front camera's frame to the world. `mode.rotation_frame` decides about quaternions.
 pub fn placed(config: &Config, gaussians: Gaussians, camera_to_world: &RigidTransform) -> Gaussians {
     match config.rotation_frame() {
         RotationFrame::Camera => gaussians.transformed(camera_to_world),
@@ -110,7 +110,7 @@ impl Reconstructor {
         &self.config
     }
 
-    /// Turns a front and a back photograph into Gaussians. `stage` is called with the name of each module before it runs.
+    /// Turns a front and a back photograph into Gaussians. `stage` gets the name of each module before it runs.
     ///
     /// # Panics
     /// If a photograph's arrays do not have the canvas size.

@@ -1,4 +1,4 @@
-//! What a run did, what it left out and why, and the time of each module: data, which the command line turns into words.
+//! The steps of a run, the omitted steps with reasons, and the time of each module, as data and as lines for `-v`.
 
 use std::fmt;
 use std::time::{Duration, Instant};
@@ -7,7 +7,7 @@ use burn::tensor::Device;
 use serde::Serialize;
 
 use crate::config::Downsample;
-use crate::crop::Window;
+use crate::window::Window;
 
 /// A step of a run, or one that was left out.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -59,7 +59,7 @@ pub enum Step {
     },
     /// Colours of the sides were left out.
     NoSideColors {
-        /// As the caller wanted; otherwise there are no sides.
+        /// Whether the caller asked for this; otherwise there are no sides.
         as_asked: bool,
     },
     /// The regressor received the `window` of some views.
@@ -73,7 +73,7 @@ pub enum Step {
         /// The box around the person.
         person: Window,
     },
-    /// The regressor left views out in which no pixel is valid.
+    /// The regressor did not run: no pixel of these views is valid.
     NoRegressor {
         /// The views.
         views: &'static str,
@@ -93,7 +93,7 @@ pub enum Step {
         /// Their number.
         gaussians: usize,
     },
-    /// The reconstruction of many photographs is that of this number of pairs. The other steps are those of the first pair.
+    /// Several pairs of photographs were reconstructed. The other steps belong to the first pair.
     Pairs {
         /// Their number.
         pairs: usize,
@@ -159,7 +159,7 @@ impl fmt::Display for Step {
 pub struct Record<'a> {
     /// What ran, and what was left out.
     pub steps: Vec<Step>,
-    /// Time per module, the device synchronised before and after each. Empty for a silent record.
+    /// Time per module, with the device synchronised before and after each. Empty for a silent record.
     pub times: Vec<(&'static str, Duration)>,
     watch: Option<Watch<'a>>,
 }

@@ -1,5 +1,5 @@
-//! The network that finds a person's pixels: U²-Net small (Qin et al., "U²-Net: Going Deeper with Nested U-Structure for Salient Object
-//! Detection", 2020), with its published weights. Batch norms are part of the convolutions.
+//! The network that finds a person's pixels: U²-Net small (Qin et al., "U²-Net: Going Deeper with Nested U-Structure
+//! for Salient Object Detection", 2020), with its published weights. Batch norms are folded into the convolutions.
 
 use std::iter;
 
@@ -19,8 +19,8 @@ pub const SIDE: usize = 320;
 /// Mean and standard deviation of the colours in training (ImageNet's).
 const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
-/// Levels of the encoder's blocks, and whether their levels are dilated convolutions of one size instead of halved sizes (Qin et al.,
-/// figure 5). The decoder's blocks are those of the first five in reverse order.
+/// The encoder's blocks: the number of levels, and whether levels halve the size or dilate the convolutions instead
+/// (Qin et al., figure 5). The decoder has the first five blocks in reverse order.
 const BLOCKS: [(usize, Levels); 6] = [
     (7, Levels::Halved),
     (6, Levels::Halved),
@@ -38,9 +38,9 @@ enum Levels {
 
 /// U²-Net small, 1.1 million parameters.
 pub struct U2Net {
-    /// By block, in the order in which they run.
+    /// In the order in which they run.
     blocks: Vec<Block>,
-    /// One plane from each level, finest first.
+    /// From each level to one plane, finest level first.
     sides: Vec<Conv2d>,
     /// From all planes to one.
     fuse: Conv2d,
@@ -133,7 +133,7 @@ impl Block {
     }
 }
 
-/// Channels of a coarse level, enlarged to a fine one's size, before those of the fine one.
+/// The channels of `coarse`, enlarged to the size of `fine`, followed by the channels of `fine`.
 fn joined(coarse: Tensor<4>, fine: Tensor<4>) -> Tensor<4> {
     let [_, _, height, width] = fine.dims();
     Tensor::cat(vec![bilinear(coarse, [height, width], false), fine], 1)

@@ -1,45 +1,62 @@
 //! A pool of memory blocks for the operators. The system clears every fresh page. For images of this size that takes
 //! about as long as the operators' arithmetic.
 
+use std::ops::{Deref, DerefMut};
 use std::sync::{Mutex, PoisonError};
 
 /// Largest number of unused values: 2 GiB of each type.
 const MOST: usize = 1 << 29;
 
-/// Unused blocks of floats.
-static FLOATS: Pool<f32> = Pool { free: Mutex::new(Vec::new()) };
-/// Unused blocks of words. A word is a pair of bf16 values.
-static WORDS: Pool<u32> = Pool { free: Mutex::new(Vec::new()) };
-
-/// `len` floats with arbitrary values.
+/// `len` arbitrary values, for a result that leaves this crate.
 pub fn take(len: usize) -> Vec<f32> {
-    FLOATS.take(len)
-}
-
-/// Returns memory to the pool, for later calls of [`take`].
-pub fn give(buffer: Vec<f32>) {
-    FLOATS.give(buffer);
-}
-
-/// `len` words with arbitrary values.
-pub fn take_words(len: usize) -> Vec<u32> {
-    WORDS.take(len)
-}
-
-/// Returns memory to the pool, for later calls of [`take_words`].
-pub fn give_words(buffer: Vec<u32>) {
-    WORDS.give(buffer);
+    f32::pool().take(len)
 }
 
 /// Returns the pool's memory to the allocator.
-pub fn release() {
-    FLOATS.release();
-    WORDS.release();
+pub fn release_buffers() {
+    f32::pool().release();
+    u32::pool().release();
+}
+
+/// Floats for a while.
+pub type Floats = Scratch<f32>;
+/// Words for a while. A word is a pair of bf16 values.
+pub type Words = Scratch<u32>;
+
+/// A block of values that returns to the pool when it is dropped.
+#[derive(Debug, Clone)]
+pub struct Scratch<T: Bits>(Vec<T>);
+
+impl<T: Bits> Scratch<T> {
+    /// `len` values, which are arbitrary.
+    pub fn new(len: usize) -> Self {
+        Self(T::pool().take(len))
+    }
+}
+
+impl<T: Bits> Deref for Scratch<T> {
+    type Target = [T];
+
+    fn deref(&self) -> &[T] {
+        &self.0
+    }
+}
+
+impl<T: Bits> DerefMut for Scratch<T> {
+    fn deref_mut(&mut self) -> &mut [T] {
+        &mut self.0
+    }
+}
+
+impl<T: Bits> Drop for Scratch<T> {
+    fn drop(&mut self) {
+        T::pool().give(std::mem::take(&mut self.0));
+    }
 }
 
 /// Unused blocks of values.
 #[derive(Default)]
-struct Pool<T> {
+pub struct Pool<T> {
     free: Mutex<Vec<Vec<T>>>,
 }
 
@@ -91,9 +108,24 @@ fn arbitrary<T: Bits>(len: usize) -> Vec<T> {
 }
 
 /// Types for which every pattern of bits is valid.
-trait Bits: Copy + Default {}
-impl Bits for f32 {}
-impl Bits for u32 {}
+pub trait Bits: Copy + Default + 'static {
+    /// The unused blocks of this type.
+    fn pool() -> &'static Pool<Self>;
+}
+
+impl Bits for f32 {
+    fn pool() -> &'static Pool<Self> {
+        static FLOATS: Pool<f32> = Pool { free: Mutex::new(Vec::new()) };
+        &FLOATS
+    }
+}
+
+impl Bits for u32 {
+    fn pool() -> &'static Pool<Self> {
+        static WORDS: Pool<u32> = Pool { free: Mutex::new(Vec::new()) };
+        &WORDS
+    }
+}
 
 #[cfg(test)]
 mod tests {

@@ -5,20 +5,22 @@
 //! `expand` sums one dimension after the other. Burn's broadcasting sums all dimensions at once, with one thread per
 //! parameter.
 
+use std::f64::consts::FRAC_1_SQRT_2;
+
 use burn::module::Param;
 use burn::nn;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
-use burn::tensor::activation::relu;
+use burn::tensor::activation::{gelu, relu};
 use burn::tensor::{FloatDType, Tensor};
 
-use crate::buffers::give;
+use crate::device::{has_kernels, in_f32, is_bf16, is_tracked_on_gpu};
+use crate::gpu_convolution::convolve;
 use crate::op::{self, Kept, Kernel};
-use crate::train::{Conv1x1, Conv3x3, Gradients, LayerNorm, Linear, Statistics, Unfolded, Wanted};
-use crate::{gpu, has_kernels, in_f32, is_bf16, is_trained_fast};
+use crate::operators::{Conv1x1, Conv3x3, Layer, LayerNorm, Linear, Unfolded, Wanted};
 
 /// A linear layer: `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
-    if gpu::is_tracked_on_gpu(&x) {
+    if is_tracked_on_gpu(&x) {
         let y = burn::tensor::module::linear(x, layer.weight.val(), None);
         return match bias(&layer.bias) {
             Some(bias) => y.clone() + bias.unsqueeze::<3>().expand(y.dims()),
@@ -28,29 +30,39 @@ pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
     if !has_kernels(&x) {
         return layer.forward(x);
     }
-    let (sizes, shape) = linear_sizes(layer, &x);
-    run(sizes, shape, x, layer.weight.val(), bias(&layer.bias))
+    linear_on_flex(layer, x, false)
 }
 
-/// A linear layer followed by GELU (erf form), on `flex`.
-pub(crate) fn linear_gelu(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
-    let (sizes, shape) = linear_sizes(layer, &x);
-    run(Gelu(sizes), shape, x, layer.weight.val(), bias(&layer.bias))
+/// A linear layer followed by GELU (erf form): `[B, N, inputs]` → `[B, N, outputs]`.
+pub fn linear_gelu(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
+    if has_kernels(&x) {
+        return linear_on_flex(layer, x, true);
+    }
+    let has_gradient = x.device().is_autodiff();
+    let x = layer.forward(x);
+    if has_gradient {
+        // On all backends but flex, Burn's GELU has the gradient of the approximation by tanh, which is 4e-4 off.
+        return x.clone() * ((x * FRAC_1_SQRT_2).erf() + 1.0) * 0.5;
+    }
+    gelu(x)
 }
 
-fn linear_sizes(layer: &nn::Linear, x: &Tensor<3>) -> (Linear, [usize; 3]) {
+fn linear_on_flex(layer: &nn::Linear, x: Tensor<3>, gelu: bool) -> Tensor<3> {
     let ([b, n, _], [inputs, outputs], half) = (x.dims(), layer.weight.dims(), is_bf16(&layer.weight));
-    (Linear { rows: b * n, inputs, outputs, transposed: false, half }, [b, n, outputs])
+    let sizes = Linear { rows: b * n, inputs, outputs, transposed: false, half, gelu };
+    run(sizes, [b, n, outputs], x, layer.weight.val(), bias(&layer.bias))
 }
 
 /// Layer normalisation of tokens `[B, N, C]`. `epsilon` must be the layer's own value, which Burn keeps private.
 pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3> {
     let (weight, shape) = (layer.gamma.val(), x.dims());
-    if let Some(bias) = layer.beta.as_ref().filter(|_| gpu::is_tracked_on_gpu(&x)) {
+    if let Some(bias) = layer.beta.as_ref().filter(|_| is_tracked_on_gpu(&x)) {
         let affine = [weight, bias.val()].map(|parameter| parameter.unsqueeze::<3>().expand(shape));
         return in_f32(x, |x| normalised(x, epsilon, affine));
     }
-    let Some(bias) = layer.beta.as_ref().filter(|_| is_trained_fast(&x)) else {
+    // Without gradients, the results are those of Burn's operator.
+    let is_tracked = x.device().is_autodiff() && has_kernels(&x);
+    let Some(bias) = layer.beta.as_ref().filter(|_| is_tracked) else {
         return in_f32(x, |x| layer.forward(x));
     };
     let sizes = LayerNorm { channels: shape[2], epsilon: epsilon as f32 };
@@ -71,10 +83,10 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let half = is_bf16(&layer.weight);
     let is_plain = layer.groups == 1 && layer.dilation == [1, 1];
     let [down, across] = layer.stride;
-    if is_plain && rows == columns && rows % 2 == 1 && down == across && gpu::is_tracked_on_gpu(&x) {
+    if is_plain && rows == columns && rows % 2 == 1 && down == across && is_tracked_on_gpu(&x) {
         let dtype = x.dtype();
         let x = if rectified { relu(x) } else { x };
-        let y = gpu::convolve(x.cast(weight.dtype()), weight, down);
+        let y = convolve(x.cast(weight.dtype()), weight, down);
         return match bias {
             Some(bias) => y.clone() + bias.reshape([1, outputs, 1, 1]).expand(y.dims()),
             None => y,
@@ -136,112 +148,13 @@ pub fn patches(layer: &Conv2d, x: Tensor<4>) -> Tensor<3> {
     let (rows, columns, inputs) = (height / side, width / side, channels * side * side);
     let patches = x.reshape([batch, channels, rows, side, columns, side]).permute([0, 2, 4, 1, 3, 5]);
     let half = is_bf16(&layer.weight);
-    let sizes = Linear { rows: batch * rows * columns, inputs, outputs, transposed: true, half };
+    let sizes = Linear { rows: batch * rows * columns, inputs, outputs, transposed: true, half, gelu: false };
     let x: Tensor<2> = patches.reshape([sizes.rows, inputs]);
     run(sizes, [batch, rows * columns, outputs], x, layer.weight.val(), bias(&layer.bias))
 }
 
 fn bias(bias: &Option<Param<Tensor<1>>>) -> Option<Tensor<1>> {
     bias.as_ref().map(Param::val)
-}
-
-/// A function of an input, a weight and an optional bias, with its gradients.
-trait Layer: std::fmt::Debug + Send + Sync + 'static {
-    /// Values that the backward pass needs beside the input and the weight.
-    type Kept: Send + 'static;
-
-    /// `keep`: a backward pass will follow.
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept);
-
-    fn backward(&self, x: &[f32], weight: &[f32], kept: Self::Kept, dy: &[f32], wanted: Wanted) -> Gradients;
-}
-
-macro_rules! keeps_nothing {
-    ($($layer:ty),+) => {
-        $(impl Layer for $layer {
-            type Kept = ();
-
-            fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
-                (<$layer>::forward(self, x, weight, bias), ())
-            }
-
-            fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
-                <$layer>::backward(self, x, weight, dy, wanted)
-            }
-        })+
-    };
-}
-
-keeps_nothing!(Conv1x1, Conv3x3, Unfolded);
-
-impl Layer for Linear {
-    type Kept = ();
-
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
-        (Self::forward(self, x, weight, bias), ())
-    }
-
-    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
-        Self::backward(self, x, weight, None, dy, wanted)
-    }
-}
-
-/// A linear layer followed by GELU.
-#[derive(Debug)]
-struct Gelu(Linear);
-
-impl Layer for Gelu {
-    /// The values before GELU, if kept.
-    type Kept = Option<Vec<f32>>;
-
-    fn forward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        bias: Option<&[f32]>,
-        keep: bool,
-    ) -> (Vec<f32>, Option<Vec<f32>>) {
-        self.0.forward_gelu(x, weight, bias, keep)
-    }
-
-    fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        before: Option<Vec<f32>>,
-        dy: &[f32],
-        wanted: Wanted,
-    ) -> Gradients {
-        let before = before.expect("kept by the forward pass");
-        let gradients = self.0.backward(x, weight, Some(&before), dy, wanted);
-        give(before);
-        gradients
-    }
-}
-
-impl Layer for LayerNorm {
-    type Kept = Vec<Statistics>;
-
-    fn forward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        bias: Option<&[f32]>,
-        _keep: bool,
-    ) -> (Vec<f32>, Vec<Statistics>) {
-        Self::forward(self, x, weight, bias.expect("the published norms have biases"))
-    }
-
-    fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        statistics: Vec<Statistics>,
-        dy: &[f32],
-        wanted: Wanted,
-    ) -> Gradients {
-        Self::backward(self, x, weight, &statistics, dy, wanted)
-    }
 }
 
 /// A layer as an operator.

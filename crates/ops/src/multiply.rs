@@ -1,10 +1,10 @@
-//! Matrix products on one thread, in f32 by the gemm crate or in bf16 by [`crate::half`]. Callers divide the work among
+//! Matrix products on one thread, in f32 by the gemm crate or in bf16 by [`crate::bf16`]. Callers divide the work among
 //! threads by sizes alone, so that every element is one sum in one order.
 
 use rayon::prelude::*;
 
-use crate::buffers::{give_words, take_words};
-use crate::half::{self, PANEL, SLACK, Source};
+use crate::bf16::{self, PANEL, SLACK, Source};
+use crate::buffers::Words;
 
 /// A matrix in f32: values, and their (column, row) strides in elements.
 pub type Matrix<'a> = (&'a [f32], [usize; 2]);
@@ -14,21 +14,21 @@ pub enum Right<'a> {
     /// In f32, not packed.
     Plain(Matrix<'a>),
     /// In bf16, packed by [`Source::pack_right`].
-    Packed(Vec<u32>),
+    Packed(Words),
 }
 
 impl<'a> Right<'a> {
     /// The factor in bf16 if `half` is set and the processor has the instructions, else in f32.
     pub fn new(half: bool, [k, n]: [usize; 2], matrix: Matrix<'a>) -> Self {
-        if half && half::is_there() { Self::packed([k, n], matrix) } else { Self::Plain(matrix) }
+        if half && bf16::is_there() { Self::packed([k, n], matrix) } else { Self::Plain(matrix) }
     }
 
     pub(crate) fn packed([depth, columns]: [usize; 2], (values, [stride, inner]): Matrix) -> Self {
         /// Words per task.
         const PIECE: usize = 32 * 1024;
         let source = Source { values, stride, inner, count: columns, depth };
-        let panel = source.blocks() * half::PAIRS * PANEL;
-        let mut words = take_words(source.words_right());
+        let panel = source.blocks() * bf16::PAIRS * PANEL;
+        let mut words = Words::new(source.words_right());
         let pack = |(i, out): (usize, &mut [u32])| {
             let first = i * PANEL;
             let values = &values[first * stride..];
@@ -41,14 +41,6 @@ impl<'a> Right<'a> {
             words.par_chunks_exact_mut(panel).with_min_len(PIECE.div_ceil(panel)).enumerate().for_each(pack);
         }
         Self::Packed(words)
-    }
-}
-
-impl Drop for Right<'_> {
-    fn drop(&mut self) {
-        if let Self::Packed(words) = self {
-            give_words(std::mem::take(words));
-        }
     }
 }
 
@@ -77,23 +69,22 @@ impl Multiply<'_> {
         /// Words of the left factor that are packed at once: 128 KiB, which leaves second-level cache for a panel.
         const WORDS: usize = 32 * 1024;
         let Self { size: [m, columns, depth], lhs: (values, [inner, row]), add, .. } = *self;
-        let blocks = depth.div_ceil(half::BLOCK);
-        let most = (WORDS / (blocks * half::PAIRS)).next_multiple_of(4 * half::PAIRS);
+        let blocks = depth.div_ceil(bf16::BLOCK);
+        let most = (WORDS / (blocks * bf16::PAIRS)).next_multiple_of(4 * bf16::PAIRS);
         for first in (0..m).step_by(most) {
             let values = &values[first * row..];
             let source = Source { values, stride: row, inner, count: most.min(m - first), depth };
             let packed = source.packed_rows();
-            let mut words = take_words((blocks * packed + SLACK) * half::PAIRS);
+            let mut words = Words::new((blocks * packed + SLACK) * bf16::PAIRS);
             let (rows, _) = words.as_chunks_mut();
             source.pack_left(&mut rows[..blocks * packed]);
-            half::product(&source, rows, rhs.as_chunks::<PANEL>().0, columns, |row, column, sums| {
+            bf16::product(&source, rows, rhs.as_chunks::<PANEL>().0, columns, |row, column, sums| {
                 let out = &mut out[(first + row) * stride + column..][..sums.len()];
                 match add {
                     true => out.iter_mut().zip(sums).for_each(|(out, sum)| *out += sum),
                     false => out.copy_from_slice(sums),
                 }
             });
-            give_words(words);
         }
     }
 

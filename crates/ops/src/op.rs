@@ -1,5 +1,5 @@
-//! Operators with their own gradients, as one Burn backend extension. Only this file, `gpu` and `rows` use Burn's
-//! backend interfaces, which change with every minor version of Burn.
+//! Operators with their own gradients, as one Burn backend extension. Only this file, `gpu_convolution` and `gather` use
+//! Burn's backend interfaces, which change with every minor version of Burn.
 
 use std::any::Any;
 use std::fmt::Debug;

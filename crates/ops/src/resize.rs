@@ -1,23 +1,78 @@
 //! Bilinear resize of planes and its gradient. Every input row is resized to the output's width once, and every output
 //! row is a mean of two resized rows.
 
-use crate::buffers::take;
+use burn::tensor::module::interpolate;
+use burn::tensor::ops::{InterpolateMode, InterpolateOptions};
+use burn::tensor::{Tensor, TensorData};
 use pulp::Arch;
 use rayon::prelude::*;
-use snapsnap_base::bilinear::Tap;
+use snapsnap_base::bilinear::{Tap, taps};
 
-/// Taps as a matrix `[taps.len(), from]`, row-major.
-pub fn matrix(taps: &[Tap], from: usize) -> Vec<f32> {
-    let mut values = vec![0.0_f32; taps.len() * from];
-    for (row, &(low, high, weight)) in values.chunks_exact_mut(from).zip(taps) {
-        row[low] += 1.0 - weight;
-        row[high] += weight;
+use crate::buffers::take;
+use crate::device::has_kernels;
+use crate::op::{self, Kept, Kernel};
+
+/// Bilinear resize of `[B, C, H, W]` to `size` (rows, columns).
+///
+/// `align_corners`: the outermost samples coincide (inside the DPT head). Otherwise the outer edges of the pixels
+/// coincide (everywhere else). [0, 1] becomes [0, ⅓, ⅔, 1] or [0, ¼, ¾, 1] (docs/method.md, "Check values").
+pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4> {
+    let ([_, _, h, w], device) = (x.dims(), x.device());
+    let [down, across] = [(h, size[0]), (w, size[1])].map(|(from, to)| taps(from, to, align_corners));
+    if has_kernels(&x) {
+        let none: Option<Tensor<1>> = None;
+        return op::run(Resize { from: x.dims(), down, across }, x, none.clone(), none);
     }
-    values
+    if device.is_autodiff() {
+        // Burn's own operator has no backward pass on GPUs. Products with constant matrices have one.
+        let matrix = |taps: &[Tap], from: usize| {
+            let mut values = vec![0.0_f32; taps.len() * from];
+            for (row, &(low, high, weight)) in values.chunks_exact_mut(from).zip(taps) {
+                row[low] += 1.0 - weight;
+                row[high] += weight;
+            }
+            let data = TensorData::new(values, [taps.len(), from]);
+            Tensor::<2>::from_data(data, &device).cast(x.dtype())
+        };
+        let (down, across) = (matrix(&down, h).unsqueeze(), matrix(&across, w).transpose().unsqueeze());
+        return down.matmul(x).matmul(across);
+    }
+    let options = InterpolateOptions::new(InterpolateMode::Bilinear).with_align_corners(align_corners);
+    interpolate(x, options.with_output_size(size))
+}
+
+/// A bilinear resize.
+#[derive(Debug)]
+struct Resize {
+    /// B, C, H, W of the input.
+    from: [usize; 4],
+    down: Vec<Tap>,
+    across: Vec<Tap>,
+}
+
+impl Kernel for Resize {
+    fn shape(&self) -> Vec<usize> {
+        vec![self.from[0], self.from[1], self.down.len(), self.across.len()]
+    }
+
+    fn forward(&self, [x, ..]: [&[f32]; 3], _keep: bool) -> (Vec<f32>, Kept) {
+        (resize(x, [self.from[2], self.from[3]], &self.down, &self.across), None)
+    }
+
+    fn backward(
+        &self,
+        _inputs: [&[f32]; 3],
+        _kept: Kept,
+        upstream: &[f32],
+        _wanted: [bool; 3],
+    ) -> [Option<Vec<f32>>; 3] {
+        let size = [self.from[2], self.from[3]];
+        [Some(resize_gradient(upstream, size, &self.down, &self.across)), None, None]
+    }
 }
 
 /// Planes `[count, rows, columns]` → `[count, down.len(), across.len()]`.
-pub fn resize(planes: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across: &[Tap]) -> Vec<f32> {
+fn resize(planes: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across: &[Tap]) -> Vec<f32> {
     let count = planes.len() / (rows * columns);
     let mut out = vec![0.0_f32; count * down.len() * across.len()];
     out.par_chunks_mut(down.len() * across.len()).zip(planes.par_chunks(rows * columns)).for_each(
@@ -51,12 +106,7 @@ fn stretch(row: &[f32], across: &[Tap], out: &mut [f32]) {
 
 /// Gradient of the planes `[count, rows, columns]` of [`resize`], from the gradient of its result
 /// `[count, down.len(), across.len()]`.
-pub fn resize_gradient(
-    gradient: &[f32],
-    [rows, columns]: [usize; 2],
-    down: &[Tap],
-    across: &[Tap],
-) -> Vec<f32> {
+fn resize_gradient(gradient: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across: &[Tap]) -> Vec<f32> {
     let size = down.len() * across.len();
     let mut out = take(gradient.len() / size * rows * columns);
     let (down, across) = (Back::new(down, rows), Back::new(across, columns));

@@ -3,7 +3,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 
-use crate::in_f32;
+use crate::device::in_f32;
 
 /// Cosines and sines of every token's rotation angles, for one grid and one head size.
 #[derive(Debug, Clone)]

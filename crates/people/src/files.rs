@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use snapsnap_base::FileError;
 
-/// Entries of a folder in the order of their names, without hidden ones, which some systems add to copied folders.
+/// Entries of a folder in order of name, without hidden files, which some systems add to copied folders.
 ///
 /// # Errors
 /// [`FileError::Read`].
@@ -21,7 +21,7 @@ pub fn entries(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
     Ok(paths)
 }
 
-/// The [`entries`] with this ending, in capitals or not.
+/// The files with this extension, in upper or lower case.
 ///
 /// # Errors
 /// [`FileError::Read`].

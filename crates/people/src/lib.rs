@@ -2,7 +2,9 @@
 //! characters from files ([`avatars`]).
 
 pub mod avatars;
+mod figure;
 mod files;
+mod joint_names;
 pub mod makehuman;
 mod math;
 mod pattern;

@@ -1,4 +1,4 @@
-//! Functions with the same results on every machine. The standard library's sine differs between systems in its last digits.
+//! Functions with equal results on every machine. The standard sine differs between systems in the last digits.
 
 use std::f32::consts::PI;
 
@@ -36,7 +36,7 @@ pub fn smooth_min(a: f32, b: f32, radius: f32) -> f32 {
     a.min(b) - overlap * overlap * radius / 4.0
 }
 
-/// A number in [0, 1) for a point of a lattice.
+/// Hash of a lattice point, in [0, 1).
 pub fn hash(x: i32, y: i32, z: i32, seed: u32) -> f32 {
     let mut h = seed.wrapping_mul(0x9e37_79b9);
     for v in [x, y, z] {
@@ -48,7 +48,7 @@ pub fn hash(x: i32, y: i32, z: i32, seed: u32) -> f32 {
     (h >> 8) as f32 / (1 << 24) as f32
 }
 
-/// Smooth noise in [0, 1], one bump per unit.
+/// Value noise in [0, 1] on a lattice of unit spacing.
 pub fn noise(p: Vec3, seed: u32) -> f32 {
     let cell = p.floor();
     let f = p - cell;
@@ -66,14 +66,9 @@ pub fn noise(p: Vec3, seed: u32) -> f32 {
     a + (b - a) * w.z
 }
 
-/// Smooth noise on a plane.
+/// Value noise on a plane.
 pub fn noise2(p: Vec2, seed: u32) -> f32 {
     noise(p.extend(0.5), seed)
-}
-
-/// Smallest and largest coordinates; infinite without points.
-pub fn bounds(points: impl Iterator<Item = Vec3>) -> (Vec3, Vec3) {
-    points.fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)))
 }
 
 #[cfg(test)]

@@ -73,7 +73,7 @@ impl Pattern {
         Self::of(QUIET[random.random_range(0..QUIET.len())], random, 0.6)
     }
 
-    /// `strength`: factor of strong saturations.
+    /// `strength` scales the saturation, except of grey cloth.
     fn of(kind: Kind, random: &mut impl Rng, strength: f32) -> Self {
         let base: f32 = random.random_range(0.0..1.0);
         // Much cloth is black, white or grey.
@@ -177,7 +177,7 @@ impl Pattern {
 pub struct Print {
     /// Colours of the picture.
     colors: [Vec3; 2],
-    /// Number of two digits; without one, the picture is a sign.
+    /// Number of two digits; `None` for a sign.
     number: Option<u32>,
     sign: u32,
     /// Height in metres.
@@ -199,7 +199,7 @@ const DIGITS: [[u8; 5]; 10] = [
 ];
 
 impl Print {
-    /// A picture in contrast to cloth of the colour `on`.
+    /// A picture that contrasts with cloth of the colour `on`.
     pub fn draw(random: &mut impl Rng, on: Vec3) -> Self {
         let bright = on.element_sum() > 1.4;
         let value = if bright { random.random_range(0.05..0.4) } else { random.random_range(0.75..1.0) };

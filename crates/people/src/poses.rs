@@ -1,15 +1,16 @@
-//! Poses from motion files (BVH): the places of the joints become the angles of a pose, for any body.
+//! Poses from motion files (BVH): the positions of the joints become the angles of a pose, for any body.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use glam::{Mat3, Vec3};
 use rand::Rng;
 use snapsnap_base::{FileError, file, quoted};
 
+use crate::figure::{Pose, sign};
 use crate::files::with_ending;
+use crate::joint_names::{Name, known, need};
 use crate::math::{rotate_x, rotate_y, rotate_z};
 use crate::skeleton::hanging;
-use crate::synth::figure::{Pose, sign};
 
 /// Largest file, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
@@ -31,27 +32,15 @@ pub struct Poses {
 }
 
 impl Poses {
-    /// The standing poses in the files `.bvh` of a folder. Other poses, such as seated ones, are left out.
+    /// The standing poses in the files `.bvh` of a folder; `None` without one. Other poses, such as seated ones, are
+    /// left out.
     ///
     /// # Errors
-    /// [`FileError`] for a folder or a file that cannot be read, and a folder without a standing pose.
-    pub fn open(folder: &Path) -> Result<Self, FileError> {
-        let none = || FileError::unsuitable(folder, "none of its files .bvh has a standing pose");
-        Self::among(&with_ending(folder, "bvh")?)?.ok_or_else(none)
-    }
-
-    /// As [`Self::open`], but `None` without the folder or without a standing pose.
-    ///
-    /// # Errors
-    /// [`FileError`] for a file that cannot be read.
-    pub fn within(folder: &Path) -> Result<Option<Self>, FileError> {
-        if folder.is_dir() { Self::among(&with_ending(folder, "bvh")?) } else { Ok(None) }
-    }
-
-    fn among(paths: &[PathBuf]) -> Result<Option<Self>, FileError> {
+    /// [`FileError`] for a folder or a file that cannot be read.
+    pub fn open(folder: &Path) -> Result<Option<Self>, FileError> {
         let mut poses = Vec::new();
-        for path in paths {
-            poses.extend(read(path)?.into_iter().filter(Pose::stands));
+        for path in with_ending(folder, "bvh")? {
+            poses.extend(read(&path)?.into_iter().filter(Pose::stands));
         }
         Ok((!poses.is_empty()).then_some(Self { poses }))
     }
@@ -79,7 +68,7 @@ impl Poses {
     }
 }
 
-/// A joint: its parent's row, its offset from the parent, and its channels.
+/// A joint: its parent's index, its offset from the parent, and its channels.
 struct Joint {
     name: String,
     parent: Option<usize>,
@@ -87,7 +76,7 @@ struct Joint {
     channels: Vec<Channel>,
 }
 
-/// The axis of a rotation; `None` for a position, since bones do not change their lengths.
+/// Axis of a rotation channel; `None` for a position channel, which is ignored, since bones keep their lengths.
 type Channel = Option<usize>;
 
 fn channel(word: &str) -> Option<Channel> {
@@ -122,7 +111,7 @@ fn parse(text: &str) -> Result<Vec<Pose>, String> {
     };
     expect(words.next(), "HIERARCHY")?;
     let mut joints: Vec<Joint> = Vec::new();
-    // Rows of the joints around the current place; `None` for an end without a name.
+    // Indices of the open joints; `None` for an end site, which has no name.
     let mut open: Vec<Option<usize>> = Vec::new();
     loop {
         let word = words.next().ok_or("ends within its joints")?;
@@ -202,7 +191,7 @@ fn number(word: Option<&str>) -> Result<f32, String> {
     number.ok_or_else(|| format!("has `{}` instead of a number", quoted(word)))
 }
 
-/// Rows of the joints that a pose is made of. Sides are 0 for the left and 1 for the right.
+/// Indices of the joints that determine a pose. Sides are 0 for the left and 1 for the right.
 struct Rows {
     neck: usize,
     /// Shoulder, elbow and wrist.
@@ -213,48 +202,31 @@ struct Rows {
 
 impl Rows {
     fn find(joints: &[Joint]) -> Result<Self, String> {
-        let row = |names: &[&str], side: usize| {
-            let [long, short] = if side == 0 { ["Left", "L"] } else { ["Right", "R"] };
-            names.iter().find_map(|name| {
-                let wanted = [format!("{long}{name}"), format!("{name}.{short}"), format!("{name}_{short}")];
-                let is_it = |joint: &Joint| {
-                    let own = joint.name.rsplit(':').next().unwrap_or_default();
-                    wanted.iter().any(|wanted| own.eq_ignore_ascii_case(wanted))
-                };
-                joints.iter().position(is_it)
-            })
+        let known: Vec<Option<(Name, usize)>> = joints.iter().map(|joint| known(&joint.name)).collect();
+        let limb = |names: [Name; 3], side: usize| -> Result<[usize; 3], String> {
+            let [first, second, third] = names.map(|name| need(&known, name, side));
+            Ok([first?, second?, third?])
         };
-        let need = |names: &[&str], side: usize| {
-            let word = if side == 0 { "left" } else { "right" };
-            row(names, side).ok_or_else(|| format!("has no {word} joint `{}`", names.join("` or `")))
-        };
-        let neck = |joint: &Joint| {
-            let name = joint.name.rsplit(':').next().unwrap_or_default().to_ascii_lowercase();
-            name == "neck" || name == "neck01"
-        };
-        let limb = |names: [&[&str]; 3], side: usize| -> Result<[usize; 3], String> {
-            Ok([need(names[0], side)?, need(names[1], side)?, need(names[2], side)?])
-        };
-        let arm: [&[&str]; 3] = [&["Arm", "upperarm01"], &["ForeArm", "lowerarm01"], &["Hand", "wrist"]];
-        let leg: [&[&str]; 3] = [&["UpLeg", "upperleg01"], &["Leg", "lowerleg01"], &["Foot", "foot"]];
+        let arm = [Name::UpperArm, Name::Forearm, Name::Hand];
+        let leg = [Name::Thigh, Name::Calf, Name::Foot];
         Ok(Self {
-            neck: joints.iter().position(neck).ok_or("has no joint `Neck` or `neck01`")?,
+            neck: need(&known, Name::Neck, 0)?,
             arms: [limb(arm, 0)?, limb(arm, 1)?],
             legs: [limb(leg, 0)?, limb(leg, 1)?],
         })
     }
 
-    /// The pose of joints at these places, in any position and direction.
+    /// The pose of joints at these positions. Position and heading of the person do not matter.
     fn pose(&self, places: &[Vec3]) -> Pose {
         let at = |row: usize| places[row];
         let [left, right] = self.legs.map(|leg| at(leg[0]));
         let up = at(self.neck) - 0.5 * (left + right);
-        // Some files have y upwards, others z. The hips look along the third axis.
+        // Some files have y up, others z. The hips face along the third axis.
         let vertical = if up.z.abs() > up.y.abs() { Vec3::Z } else { Vec3::Y };
         let world = hanging(-vertical, left - right);
         let inside = |v: Vec3| world.transpose() * v;
         let chest = hanging(-inside(up), inside(at(self.arms[0][0]) - at(self.arms[1][0])));
-        // As `Pose::trunk_frame` shares a lean and a turn among pelvis and chest.
+        // By `Pose::trunk_frame` the pelvis has 0.3 of the lean, and 0.4 of the turn lies between pelvis and chest.
         let pelvis = hanging(-inside(up).lerp(up.length() * Vec3::Y, 0.7), Vec3::X);
         let front = chest.z_axis;
         let turn = libm::atan2f(front.x, front.z).to_degrees();
@@ -298,7 +270,7 @@ impl Pose {
         lean.abs() < LEAN && aside.abs() < LEAN && self.legs.iter().all(is_straight)
     }
 
-    /// The same with left and right exchanged.
+    /// The pose with left and right exchanged.
     fn mirrored(self) -> Self {
         let ([lean, turn, aside], [nod, look, tilt]) = (self.trunk, self.head);
         let ([left, right], [a, b]) = (self.arms, self.legs);
@@ -317,7 +289,7 @@ mod tests {
     use snapsnap_base::random::stream;
 
     use super::*;
-    use crate::synth::figure::{Build, Figure};
+    use crate::figure::{Build, Figure};
 
     /// A motion file of one frame without rotations, whose offsets are a figure's bones, turned, with z upwards.
     fn bvh(figure: &Figure) -> String {
@@ -362,7 +334,7 @@ mod tests {
         let build = Build::draw(&mut random);
         for index in 0..40 {
             let mut pose = Pose::draw(&mut random);
-            // Larger arms have two descriptions.
+            // Beyond 80°, an arm has two descriptions.
             pose.arms.iter_mut().for_each(|arm| arm[0] = arm[0].min(80.0));
             let figure = Figure::new(build.clone(), &pose);
             let found = parse(&bvh(&figure)).expect("reads").remove(0);
@@ -371,13 +343,13 @@ mod tests {
             let ways = |figure: &Figure| {
                 let chest = figure.chest.frame.transpose();
                 let pelvis = figure.pelvis.frame.transpose();
-                let way = |bone: &crate::synth::figure::Bone| (bone.end - bone.start).normalize();
+                let way = |bone: &crate::figure::Bone| (bone.end - bone.start).normalize();
                 let arms = figure.upper_arms.iter().chain(&figure.forearms).map(|bone| chest * way(bone));
                 let legs = figure.thighs.iter().chain(&figure.calves).map(|bone| pelvis * way(bone));
                 arms.chain(legs).collect::<Vec<_>>()
             };
             for (limb, (a, b)) in ways(&figure).into_iter().zip(ways(&again)).enumerate() {
-                // Hips and shoulders are turned and leant as their joints show, not as the trunk's axes are.
+                // Hips and shoulders follow the positions of their joints, not the trunk's axes.
                 assert!(turned(a, b) < 9.0, "pose {index}, limb {limb}: {} {pose:?} {found:?}", turned(a, b));
             }
         }
@@ -394,7 +366,7 @@ mod tests {
             ("Frames: 1", "Frames: many", "no number of frames"),
             ("CHANNELS 3", "CHANNELS 9", "number of channels"),
             ("Zrotation", "Wrotation", "unknown channels"),
-            ("LeftForeArm", "Left", "no left joint `ForeArm` or `lowerarm01`"),
+            ("LeftForeArm", "Left", "no joint `LeftForeArm`"),
             ("MOTION", "}\nMOTION", "closes more joints than it opens"),
             ("OFFSET 0 0 0", "OFFSET 0 0 inf", "`inf` instead of a number"),
             ("End Site", "Begin Site", "`Begin` among its joints"),

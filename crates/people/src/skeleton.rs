@@ -1,12 +1,12 @@
-//! Bones of any rig and their places in a pose, and hands that sink into the body.
+//! Bones of any rig and their transforms in a pose, and hands that sink into the body.
 
 use glam::{Mat3, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
+use crate::figure::{Bone as Limb, Figure, Pose, sign};
 use crate::math::{rotate_x, rotate_y, rotate_z};
-use crate::synth::figure::{Bone as Limb, Figure, Pose, sign};
 
-/// What a bone follows. Sides are 0 for the left (towards +x) and 1 for the right.
+/// The part of a pose that a bone follows. Sides are 0 for the left (towards +x) and 1 for the right.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Joint {
     /// The trunk, from the pelvis (0) to the shoulders (1).
@@ -14,16 +14,16 @@ pub enum Joint {
     /// Neck and head, from the shoulders (0) to the skull (1).
     Head(f32),
     Clavicle(usize),
-    /// The upper arm, after so many halvings of the way from its parent.
+    /// The upper arm, after n halvings of the rotation from the parent's.
     UpperArm(usize, u8),
     Forearm(usize),
-    /// A joint of a finger, but not of the thumb, with the axis of its bend towards the palm.
+    /// A joint of a finger except the thumb, with the axis around which it bends towards the palm.
     Finger(Vec3),
-    /// The thigh, after so many halvings of the way from its parent.
+    /// The thigh, after n halvings of the rotation from the parent's.
     Thigh(usize, u8),
     Calf(usize),
     Foot(usize),
-    /// Its parent.
+    /// The parent.
     Parent,
 }
 
@@ -31,15 +31,15 @@ pub enum Joint {
 #[derive(Debug, Clone)]
 pub struct Bone {
     pub joint: Joint,
-    /// Row of its parent, which comes before it.
+    /// Index of the parent, which precedes the bone.
     pub parent: Option<usize>,
-    /// Its start.
+    /// Start of the bone.
     pub head: Vec3,
-    /// Scales of what it moves, along its own axes at rest.
+    /// Scale of the points that follow the bone.
     pub scale: Mat3,
 }
 
-/// Axes of the limbs at rest, by side, and the height of the arms.
+/// Axes of the limbs at rest, by side, and the lift of the arms.
 #[derive(Debug, Clone)]
 pub struct Rest {
     pub upper_arms: [Mat3; 2],
@@ -52,7 +52,7 @@ pub struct Rest {
 }
 
 impl Rest {
-    /// The axes of a figure whose toes point outwards by 9°, as those of [`Figure::new`].
+    /// The axes of a figure whose toes point outwards by 9°, as in [`Figure::new`].
     pub fn of(figure: &Figure) -> Self {
         let frames = |limbs: &[Limb; 2]| [limbs[0].frame, limbs[1].frame];
         Self {
@@ -66,26 +66,26 @@ impl Rest {
     }
 }
 
-/// Place of a bone in a pose.
+/// Transform of a bone in a pose.
 #[derive(Debug, Clone, Copy)]
 pub struct Placed {
     /// Rotation.
     pub turn: Mat3,
     /// Rotation and scale.
     matrix: Mat3,
-    /// Its start at rest and in the pose.
+    /// Start of the bone at rest and in the pose.
     rest: Vec3,
     head: Vec3,
 }
 
 impl Placed {
-    /// The place of a resting point that moves with the bone alone.
+    /// Moves a resting point with this bone alone.
     pub fn apply(&self, p: Vec3) -> Vec3 {
         self.matrix * (p - self.rest) + self.head
     }
 }
 
-/// Places of all bones in `pose`. `goal` is a figure in that pose; only its axes matter.
+/// Transforms of all bones in `pose`. `goal` is a figure in the same pose, of which only the axes are used.
 pub fn placed(bones: &[Bone], rest: &Rest, pose: &Pose, goal: &Figure) -> Vec<Placed> {
     let turned = |goal: &[Limb; 2], rest: &[Mat3; 2], side: usize| goal[side].frame * rest[side].transpose();
     let mut placed: Vec<Placed> = Vec::with_capacity(bones.len());
@@ -149,11 +149,11 @@ pub enum Owner {
     Other,
 }
 
-/// Whether the left and the right hand lie in trunk or legs, or nearer to them than `gap` metres.
+/// Whether the left and the right hand lie inside trunk or legs, or less than `gap` metres outside.
 pub fn sunk_hands(places: &[Vec3], normals: &[Vec3], owners: &[Owner], gap: f32) -> [bool; 2] {
-    /// One in so many vertices of a hand is checked.
+    /// Every `STEP`-th vertex of a hand is checked.
     const STEP: usize = 4;
-    /// Largest distance of a place inside the body from the nearest skin, metres.
+    /// Largest distance of a point inside the body from the nearest skin, metres.
     const REACH: f32 = 0.07;
     let of = |owner: Owner| (0..places.len()).filter(move |row| owners[*row] == owner);
     let solid: Vec<usize> = of(Owner::Solid).collect();
@@ -172,12 +172,12 @@ pub fn sunk_hands(places: &[Vec3], normals: &[Vec3], owners: &[Owner], gap: f32)
     })
 }
 
-/// Points in the form that [`tree`] is searched with.
+/// Points as queries of [`tree`].
 pub fn coordinates(points: impl IntoIterator<Item = Vec3>) -> Vec<[f32; 3]> {
     points.into_iter().map(|p| p.to_array()).collect()
 }
 
-/// A tree for searches of the nearest of many points.
+/// A k-d tree for nearest-neighbour searches.
 pub fn tree(points: impl IntoIterator<Item = Vec3>) -> ImmutableKdTree<f32, 3> {
     ImmutableKdTree::new_from_slice(&coordinates(points)).expect("fewer points than u32 can number")
 }

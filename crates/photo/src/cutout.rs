@@ -9,13 +9,18 @@ use snapsnap_base::FileError;
 use snapsnap_mesh::picture::{self, MAX_BYTES};
 use snapsnap_net::Photograph;
 
+use crate::exif_camera::{Frame, Shot};
 use crate::matting::matte;
 use crate::placing::{Mapping, Standing, on_canvas, placed, placed_as_demo};
+use crate::recentring::Turn;
+use crate::rect::Rect;
 use crate::report::{Canvas, PhotoReport};
 use crate::segmenter::segment;
-use crate::shot::Shot;
-use crate::turning::Turn;
-use crate::{Content, Cutting, Frame, MIN_SIDE, Placement, Rect, Source, rim, specks, strokes};
+use crate::source::{Content, Cutting, Placement, Source};
+use crate::{INSIDE, mask_rim, mask_strokes, specks};
+
+/// Least side of a photograph in pixels.
+const MIN_SIDE: u32 = 64;
 
 /// A photograph without its background.
 pub(super) struct Cutout<'a> {
@@ -76,17 +81,17 @@ impl<'a> Cutout<'a> {
             (Err(message), Cutting::Given) => return Err(FileError::unsuitable(path, message)),
         };
         // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
-        let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { u8::MAX.div_ceil(2) };
+        let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { INSIDE };
         // The demo removes neither specks nor rims, and a network's mask has none.
         let (specks, rim) = match placement {
             Placement::Training { .. } if is_given => {
-                (specks::remove(&mut mask, least), rim::clean(&mut rgb, &mut mask))
+                (specks::remove(&mut mask, least), mask_rim::clean(&mut rgb, &mut mask))
             }
             _ => (0, 0),
         };
         // [`matte`] has applied the strokes to a network's mask already.
         if let Some(strokes) = strokes.filter(|_| is_given) {
-            strokes::paint(strokes, &mut mask, |_, _| {});
+            mask_strokes::paint(strokes, &mut mask, |_, _| {});
         }
         let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
         if is_file && is_single_colour(&rgb, &mask) {
@@ -114,7 +119,7 @@ impl<'a> Cutout<'a> {
         let person = common.map_or(self.report.person, |standing| standing.person);
         let turn = Turn::towards(person, self.frame.size, self.frame.shot)?;
         let (rgb, mask) = turn.apply(&self.rgb, &self.mask);
-        self.report.person = Rect::around(&mask, u8::MAX.div_ceil(2))?;
+        self.report.person = Rect::around(&mask, INSIDE)?;
         self.report.turned = Some(turn.angles);
         self.frame.shot = turn.shot;
         Some((replace(&mut self.rgb, rgb), replace(&mut self.mask, mask)))

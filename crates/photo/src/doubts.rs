@@ -5,11 +5,10 @@ use std::fmt;
 use image::{GrayImage, RgbImage};
 use serde::Serialize;
 
-use super::Rect;
+use super::INSIDE;
 use super::cutout::Cutout;
+use crate::rect::Rect;
 
-/// Mask value from which a pixel belongs to the person.
-const PERSON: u8 = 128;
 /// Share of a border from which the mask counts as touching the border.
 const TOUCHED: f32 = 0.05;
 /// Number of touched borders from which a mask is doubtful.
@@ -142,7 +141,7 @@ fn borders(mask: &GrayImage) -> usize {
 
 /// Share of the places along a border that belong to the person.
 fn share(length: u32, value: impl Fn(u32) -> u8) -> f32 {
-    (0..length).filter(|at| value(*at) >= PERSON).count() as f32 / length as f32
+    (0..length).filter(|at| value(*at) >= INSIDE).count() as f32 / length as f32
 }
 
 /// The pixel at a place of the grid over the person's box, mirrored or not.
@@ -183,7 +182,7 @@ fn silhouette(one: &Cutout, mirrored: bool) -> Vec<Vec<bool>> {
         let across = middle + (2 * column + 1 - COLUMNS) * height / (2 * grid);
         let down = i64::from(y) + (2 * row + 1) * height / (2 * grid);
         let place = u32::try_from(across).ok().zip(u32::try_from(down).ok());
-        place.and_then(|(x, y)| one.mask.get_pixel_checked(x, y)).is_some_and(|mask| mask[0] >= PERSON)
+        place.and_then(|(x, y)| one.mask.get_pixel_checked(x, y)).is_some_and(|mask| mask[0] >= INSIDE)
     };
     (0..grid).map(|row| (0..COLUMNS).map(|column| inside(row, column)).collect()).collect()
 }
@@ -194,7 +193,7 @@ fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
     for (x, y) in grid() {
         let [a, b] = [(front, false), (back, mirrored)].map(|(one, mirrored)| {
             let at = place(one.report.person, x, y, mirrored);
-            (color(&one.rgb, at), one.mask.get_pixel(at.0, at.1)[0] >= PERSON)
+            (color(&one.rgb, at), one.mask.get_pixel(at.0, at.1)[0] >= INSIDE)
         });
         if a.1 || b.1 {
             sum += a.0.iter().zip(b.0).map(|(a, b)| (a - b).abs()).sum::<f32>() / 3.0;
@@ -210,7 +209,7 @@ fn skin(one: &Cutout) -> f32 {
     let Rect { x, y, width, height } = one.report.person;
     let at = |share: f32| (share * height as f32) as u32;
     let rows = y + at(FACE[0])..(y + at(FACE[1])).max(y + at(FACE[0]) + 1);
-    let inside = |x: u32, y: u32| one.mask.get_pixel(x, y)[0] >= PERSON;
+    let inside = |x: u32, y: u32| one.mask.get_pixel(x, y)[0] >= INSIDE;
     let columns: Vec<u32> =
         rows.clone().flat_map(|y| (x..x + width).filter(move |x| inside(*x, y))).collect();
     if columns.is_empty() {

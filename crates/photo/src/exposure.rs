@@ -3,7 +3,8 @@
 use glam::Vec3;
 use image::{GrayImage, RgbImage};
 
-use super::Rect;
+use super::INSIDE;
+use crate::rect::Rect;
 
 /// Number of rows of the person's box that are compared.
 const ROWS: u32 = 200;
@@ -24,7 +25,6 @@ const BRIGHTNESS: (f32, f32) = (0.28, 0.8);
 const BALANCE: (f32, f32) = (0.08, 0.3);
 /// Mask value of pixels that show the person alone.
 const WHOLE: u8 = 250;
-const INSIDE: u8 = 128;
 
 /// Multiplies the back's colours so that surfaces in both photographs have equal colours. Returns the factors; `None`
 /// if the photographs hardly differ or too few rows can be compared.
@@ -50,16 +50,11 @@ pub(super) fn match_back(
     }
     let ratio = 0.5 * sum;
     let brightness = ratio.element_sum() / 3.0;
-    let balance = ratio - brightness;
-    let corrected = |value: f32, (least, most): (f32, f32)| {
-        if value.abs() > least { value.clamp(-most, most) } else { 0.0 }
+    let corrected = |value: Vec3, (least, most): (f32, f32)| {
+        let is_large = value.abs().max_element() > least;
+        if is_large { value.clamp(Vec3::splat(-most), Vec3::splat(most)) } else { Vec3::ZERO }
     };
-    let balance = if balance.abs().max_element() > BALANCE.0 {
-        balance.clamp(Vec3::splat(-BALANCE.1), Vec3::splat(BALANCE.1))
-    } else {
-        Vec3::ZERO
-    };
-    let gain = Vec3::splat(corrected(brightness, BRIGHTNESS)) + balance;
+    let gain = corrected(Vec3::splat(brightness), BRIGHTNESS) + corrected(ratio - brightness, BALANCE);
     if gain == Vec3::ZERO {
         return None;
     }

@@ -2,129 +2,47 @@
 
 mod cutout;
 mod doubts;
+mod exif_camera;
 mod exposure;
+mod mask_rim;
+mod mask_strokes;
 mod matting;
 mod person;
 mod placing;
-mod planes;
+mod plane_map;
+mod recentring;
+mod rect;
 mod report;
 mod resize;
 mod restoration;
-mod rim;
 mod segmenter;
-mod shot;
+mod source;
 mod specks;
-mod strokes;
 #[cfg(test)]
 mod tests;
-mod turning;
 
-use std::path::Path;
-
-use image::{DynamicImage, GrayImage, RgbImage};
-use serde::Serialize;
+use glam::Vec3;
+use image::{GrayImage, Rgb, RgbImage};
 use snapsnap_base::FileError;
-use snapsnap_mesh::picture::{self, MAX_BYTES};
 use snapsnap_net::Photograph;
 
 use cutout::Cutout;
 pub use doubts::{Doubt, Sign};
+pub use exif_camera::{ELEVATIONS, FOCALS, Frame, Shot, Viewpoint};
 use exposure::match_back;
-pub use person::{DISTANCES, DistanceBy, ElevationBy, NoGaussian, Person, Seat, Told, Unplaced, person};
+pub use person::{
+    DISTANCES, DistanceBy, ElevationBy, Lens, NoGaussian, Person, Seat, Told, Unplaced, person,
+};
 use placing::together;
 pub use placing::{Mapping, on_canvas};
-pub use planes::PlaneMap;
-pub use report::{Canvas, PhotoReport};
+pub use plane_map::PlaneMap;
+pub use rect::Rect;
+pub use report::{Canvas, PhotoReport, Place};
 pub use restoration::{AXIS, Restoration, nominal, turn_to_front, turned};
-pub use shot::{ELEVATIONS, FOCALS, Shot, Viewpoint};
+pub use source::{Content, Cutting, Placement, Source};
 
-/// Least side of a photograph in pixels.
-const MIN_SIDE: u32 = 64;
-/// Side of the canvas to which constant heights and rows refer, in pixels.
-const REFERENCE_SIDE: f32 = 1024.0;
-
-/// Placement of a photograph on its canvas.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Placement {
-    /// The picture is the canvas.
-    AsIs,
-    /// The person's box is resized with antialiasing, to the place of the training subjects.
-    Training {
-        /// Height of the person in pixels of a canvas of 1024.
-        height: usize,
-    },
-    /// As in the published demo: centred, resized without antialiasing, and valid only for pixels with a full mask.
-    Demo {
-        /// Height of the person in pixels of a canvas of 1024.
-        height: usize,
-    },
-}
-
-/// What separates the person from the background.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Cutting {
-    /// Masks and alpha channels alone.
-    Given,
-    /// A network, for photographs with neither a mask nor an alpha channel.
-    Missing,
-    /// A network, for all photographs without a mask file. Alpha channels are ignored.
-    All,
-}
-
-/// Where the pixels of a photograph come from.
-#[derive(Clone, Copy)]
-pub enum Content<'a> {
-    /// The file at the source's path.
-    File,
-    /// The content of a file.
-    Bytes(&'a [u8]),
-    /// The pixels, and a mask (the person's share of each pixel) if there is one.
-    Pixels(&'a RgbImage, Option<&'a GrayImage>),
-}
-
-/// A photograph and what is known about it.
-#[derive(Clone, Copy)]
-pub struct Source<'a> {
-    /// Path of the file, or a name for messages.
-    pub path: &'a Path,
-    /// Where the pixels come from.
-    pub content: Content<'a>,
-    /// File of the mask (white: person).
-    pub mask: Option<&'a Path>,
-    /// A picture of any size that corrects the mask: white keeps, black removes, 128 changes nothing.
-    pub strokes: Option<&'a GrayImage>,
-}
-
-impl<'a> Source<'a> {
-    /// A photograph in a file, without mask file and strokes.
-    pub fn file(path: &'a Path) -> Self {
-        Self { path, content: Content::File, mask: None, strokes: None }
-    }
-
-    /// A photograph in memory, with its mask if there is one.
-    pub fn pixels(name: &'a Path, rgb: &'a RgbImage, mask: Option<&'a GrayImage>) -> Self {
-        Self { content: Content::Pixels(rgb, mask), ..Self::file(name) }
-    }
-
-    fn decode(&self) -> Result<DynamicImage, FileError> {
-        match self.content {
-            Content::File => picture::decode(self.path, MAX_BYTES),
-            Content::Bytes(bytes) => picture::decode_bytes(self.path, bytes, MAX_BYTES),
-            Content::Pixels(rgb, _) => Ok(rgb.clone().into()),
-        }
-    }
-}
-
-/// What is known about the camera of a photograph, after the photograph was turned.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Frame {
-    /// Focal length and pitch, from the file or the user.
-    pub shot: Shot,
-    /// Width and height of the photograph in pixels.
-    pub size: [u32; 2],
-    /// Map from the photograph to the canvas.
-    pub mapping: Mapping,
-}
+/// Mask value from which a pixel is the person's.
+const INSIDE: u8 = 128;
 
 /// Photographs of one person on their canvases: the front, then the back and other sides if there are more.
 #[derive(Debug, Clone)]
@@ -215,40 +133,12 @@ pub fn cut_out(source: Source, cutting: Cutting) -> Result<(RgbImage, GrayImage)
     Ok((rgb, mask))
 }
 
-/// A box of pixels.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub struct Rect {
-    /// Left.
-    pub x: u32,
-    /// Top.
-    pub y: u32,
-    /// Columns.
-    pub width: u32,
-    /// Rows.
-    pub height: u32,
-}
-
-impl Rect {
-    /// The smallest box around the pixels whose mask is at least `least`.
-    pub fn around(mask: &GrayImage, least: u8) -> Option<Self> {
-        let set = mask.enumerate_pixels().filter(|(_, _, p)| p[0] >= least);
-        let bounds = set.fold(None, |bounds, (x, y, _)| {
-            let (x0, y0, x1, y1) = bounds.unwrap_or((x, y, x, y));
-            Some((x0.min(x), y0.min(y), x1.max(x), y1.max(y)))
-        });
-        bounds.map(|(x0, y0, x1, y1)| Self { x: x0, y: y0, width: x1 - x0 + 1, height: y1 - y0 + 1 })
-    }
-
-    /// The part of this box within `reach` (x, y) pixels of the box `inner` inside it.
-    fn clipped_around(self, inner: Self, [reach_x, reach_y]: [u32; 2]) -> Self {
-        let (x, y) =
-            (self.x.max(inner.x.saturating_sub(reach_x)), self.y.max(inner.y.saturating_sub(reach_y)));
-        let right = (self.x + self.width).min(inner.x.saturating_add(inner.width).saturating_add(reach_x));
-        let bottom = (self.y + self.height).min(inner.y.saturating_add(inner.height).saturating_add(reach_y));
-        Self { x, y, width: right - x, height: bottom - y }
-    }
-}
-
+/// A channel in [0, 1].
 fn unit(value: u8) -> f32 {
     f32::from(value) / 255.0
+}
+
+/// A colour with channels in [0, 1].
+fn unit_color(pixel: &Rgb<u8>) -> Vec3 {
+    Vec3::from(pixel.0.map(f32::from)) / 255.0
 }

@@ -7,11 +7,12 @@ use image::imageops::{self, FilterType};
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use snapsnap_base::bilinear::{Tap, taps};
 
-use super::Rect;
 use super::segmenter::SIDE;
 use super::specks::{Pieces, pieces};
-use super::strokes::paint;
-use crate::resize::bilinear;
+use super::unit_color;
+use crate::mask_strokes::paint;
+use crate::rect::Rect;
+use crate::resize::{bilinear, interpolate};
 
 /// Margin of the network's second look around the person's box, as a share of the box's longer side.
 const MARGIN: f32 = 0.1;
@@ -122,7 +123,7 @@ impl Filter {
         let scaled = |length: u32| (length * FILTERED.min(longer)).div_ceil(longer).max(1);
         let (width, height) = (scaled(rgb.width()), scaled(rgb.height()));
         let small = imageops::resize(rgb, width, height, FilterType::Triangle);
-        let color: Vec<Vec3> = small.pixels().map(unit).collect();
+        let color: Vec<Vec3> = small.pixels().map(unit_color).collect();
         let size = [height as usize, width as usize];
         let wide = size[1];
         let p = bilinear(probability, [SIDE; 2], size);
@@ -169,17 +170,19 @@ impl Filter {
 
     /// Writes the coverage and the person's colours into the part of the picture for which the filter was made.
     fn cut_out(&self, picture: &mut RgbImage, mask: &mut GrayImage, part: Rect) {
-        let across = taps(self.size[1], part.width as usize, false);
-        let down = taps(self.size[0], part.height as usize, false);
+        let [rows, columns] = self.size;
+        let across = taps(columns, part.width as usize, false);
+        let down = taps(rows, part.height as usize, false);
+        let colors = |plane: &[Vec3], at: [Tap; 2]| interpolate(plane, columns, at);
         for (y, down) in (part.y..).zip(&down) {
             for (x, across) in (part.x..).zip(&across) {
                 let (at, pixel) = ([*down, *across], picture.get_pixel_mut(x, y));
-                let color = unit(pixel);
-                let share = self.at(&self.slope, at).dot(color) + self.at(&self.offset, at);
+                let color = unit_color(pixel);
+                let share = colors(&self.slope, at).dot(color) + interpolate(&self.offset, columns, at);
                 mask.put_pixel(x, y, Luma([(255.0 * between(share, SOFT)).round() as u8]));
                 let alpha = between(share, MIXED);
                 if alpha > 0.0 && alpha < 1.0 {
-                    let (person, background) = (self.at(&self.person, at), self.at(&self.background, at));
+                    let (person, background) = (colors(&self.person, at), colors(&self.background, at));
                     // The person gets its share of the residual.
                     let left = color - alpha * person - (1.0 - alpha) * background;
                     let own = (person + alpha * left).clamp(Vec3::ZERO, Vec3::ONE);
@@ -188,19 +191,6 @@ impl Filter {
             }
         }
     }
-
-    /// Interpolates a plane of the small picture.
-    fn at<T>(&self, plane: &[T], [(y0, y1, fy), (x0, x1, fx)]: [Tap; 2]) -> T
-    where
-        T: Copy + std::ops::Mul<f32, Output = T> + std::ops::Add<Output = T>,
-    {
-        let row = |y: usize| plane[y * self.size[1] + x0] * (1.0 - fx) + plane[y * self.size[1] + x1] * fx;
-        row(y0) * (1.0 - fy) + row(y1) * fy
-    }
-}
-
-fn unit(pixel: &Rgb<u8>) -> Vec3 {
-    Vec3::from_array(pixel.0.map(f32::from)) / 255.0
 }
 
 /// Pixels of gaps that are filled ([`NO_GAP`]).

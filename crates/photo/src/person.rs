@@ -11,9 +11,10 @@ use snapsnap_net::{Reconstruction, Reconstructor, placed};
 use snapsnap_ops::host;
 use snapsnap_splat::Gaussians;
 
+use crate::Photographs;
+use crate::exif_camera::{ELEVATIONS, Frame, Viewpoint};
 use crate::restoration::Restoration;
-use crate::shot::{ELEVATIONS, Viewpoint};
-use crate::{Frame, Photographs, Placement};
+use crate::source::Placement;
 
 /// Plausible distances of a camera from a standing person, in metres.
 pub const DISTANCES: RangeInclusive<f64> = 1.0..=30.0;
@@ -98,21 +99,26 @@ pub enum DistanceBy {
     /// The user told it.
     Told,
     /// It follows from the focal length.
-    Lens {
-        /// Millimetres of 35 mm film.
-        focal: f64,
-        /// Whether the user told the focal length; otherwise it is the file's.
-        told: bool,
-    },
+    Lens(Lens),
     /// The nominal distance: the focal length does not fit a person of this size.
-    Misfit {
-        /// Millimetres of 35 mm film.
-        focal: f64,
-        /// Whether the user told the focal length; otherwise it is the file's.
-        told: bool,
-    },
+    Misfit(Lens),
     /// The nominal distance: the focal length is unknown.
     Unknown,
+}
+
+/// A focal length.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Lens {
+    /// Millimetres of 35 mm film.
+    pub focal: f64,
+    /// Whether the user told the focal length; otherwise it is the file's.
+    pub told: bool,
+}
+
+impl fmt::Display for Lens {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:.0} mm of 35 mm film, {}", self.focal, if self.told { "--focal" } else { "the file" })
+    }
 }
 
 /// How an elevation is known.
@@ -130,18 +136,11 @@ pub enum ElevationBy {
 impl fmt::Display for Seat {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { distance, distance_by, height, height_assumed, elevation, elevation_by, .. } = self;
-        let whence = |told: &bool| if *told { "--focal" } else { "the file" };
         write!(f, "camera {distance:.2} m away (")?;
         match distance_by {
             DistanceBy::Told => write!(f, "--distance")?,
-            DistanceBy::Lens { focal, told } => {
-                write!(f, "{focal:.0} mm of 35 mm film, {}", whence(told))?;
-            }
-            DistanceBy::Misfit { focal, told } => write!(
-                f,
-                "nominal: {focal:.0} mm of 35 mm film, {}, does not fit a person of this size",
-                whence(told)
-            )?,
+            DistanceBy::Lens(lens) => write!(f, "{lens}")?,
+            DistanceBy::Misfit(lens) => write!(f, "nominal: {lens}, does not fit a person of this size")?,
             DistanceBy::Unknown => write!(f, "nominal: the focal length is unknown")?,
         }
         let assumed = if *height_assumed { ", assumed" } else { "" };
@@ -162,11 +161,11 @@ impl Told {
         let focal = frame.shot.focal;
         let seen = focal.map(|focal| Viewpoint::distance(focal, frame, side));
         // Turning may shorten the focal length so that the person fits. A told focal length is reported unchanged.
-        let (lens, told) = (self.focal.or(focal).unwrap_or_default(), self.focal.is_some());
+        let lens = Lens { focal: self.focal.or(focal).unwrap_or_default(), told: self.focal.is_some() };
         let (distance, distance_by) = match (self.distance, seen) {
             (Some(distance), _) => (distance * height / tall, DistanceBy::Told),
-            (None, Some(seen)) if DISTANCES.contains(&seen) => (seen, DistanceBy::Lens { focal: lens, told }),
-            (None, Some(_)) => (nominal.distance, DistanceBy::Misfit { focal: lens, told }),
+            (None, Some(seen)) if DISTANCES.contains(&seen) => (seen, DistanceBy::Lens(lens)),
+            (None, Some(_)) => (nominal.distance, DistanceBy::Misfit(lens)),
             (None, None) => (nominal.distance, DistanceBy::Unknown),
         };
         let pitch = frame.shot.pitch.zip(focal);

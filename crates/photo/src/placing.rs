@@ -5,10 +5,13 @@ use image::{GenericImageView, GrayImage, RgbImage, imageops};
 
 use snapsnap_net::Photograph;
 
-use super::{REFERENCE_SIDE, Rect, unit};
-use crate::report::Canvas;
+use super::unit;
+use crate::rect::Rect;
+use crate::report::{Canvas, Place};
 use crate::resize::{bilinear, lanczos3};
 
+/// Side of the canvas to which constant heights and rows refer, in pixels.
+const REFERENCE_SIDE: f32 = 1024.0;
 /// Middle row of a training subject on a canvas of 1024. The subject covers rows 124.39 to 862.52
 /// (docs/method.md, "Cameras").
 const TRAINING_CENTRE: f32 = 493.5;
@@ -153,8 +156,8 @@ pub(super) fn placed(
             }
         }
     }
-    let (size, at) = ([width, height], [left, top]);
-    let canvas = Canvas::Scaled { together, scale, limited_by_width, size, at, side };
+    let place = Place { size: [width, height], at: [left, top], side };
+    let canvas = Canvas::Scaled { together, scale, limited_by_width, place };
     (Photograph::new(values, on_canvas), mapping, canvas)
 }
 
@@ -203,7 +206,7 @@ pub(super) fn placed_as_demo(
         }
     }
     let valid = on_canvas.iter().map(|m| *m >= 1.0).collect();
-    let canvas = Canvas::Demo { size: [width, height], at: [left, top], side };
+    let canvas = Canvas::Demo(Place { size: [width, height], at: [left, top], side });
     (Photograph { rgb: values, mask: on_canvas, valid }, mapping, canvas)
 }
 

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-use crate::Rect;
+use crate::rect::Rect;
 
 /// What was done to a photograph on its way to the canvas.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -41,22 +41,30 @@ pub enum Canvas {
         scale: f32,
         /// Whether the person is too wide for its usual height.
         limited_by_width: bool,
-        /// Width and height on the canvas.
-        size: [usize; 2],
-        /// Left and top on the canvas.
-        at: [usize; 2],
-        /// Side of the canvas.
-        side: usize,
+        /// Its place.
+        #[serde(flatten)]
+        place: Place,
     },
     /// As in the published demo.
-    Demo {
-        /// Width and height on the canvas.
-        size: [usize; 2],
-        /// Left and top on the canvas.
-        at: [usize; 2],
-        /// Side of the canvas.
-        side: usize,
-    },
+    Demo(Place),
+}
+
+/// The place of the person's box on the canvas.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Place {
+    /// Width and height.
+    pub size: [usize; 2],
+    /// Left and top.
+    pub at: [usize; 2],
+    /// Side of the canvas.
+    pub side: usize,
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { size: [w, h], at: [x, y], side } = self;
+        write!(f, "{w}×{h} at ({x}, {y}) of {side}×{side}")
+    }
 }
 
 impl fmt::Display for PhotoReport {
@@ -81,14 +89,12 @@ impl fmt::Display for PhotoReport {
         }
         match canvas {
             Canvas::AsIs => write!(f, ", used as it is"),
-            Canvas::Scaled { together, scale, limited_by_width, size: [w, h], at: [x, y], side } => {
+            Canvas::Scaled { together, scale, limited_by_width, place } => {
                 let with = if *together { ", with the other" } else { "" };
                 let limited = if *limited_by_width { " (limited by the width)" } else { "" };
-                write!(f, "{with}, scaled by {scale:.4}{limited} to {w}×{h} at ({x}, {y}) of {side}×{side}")
+                write!(f, "{with}, scaled by {scale:.4}{limited} to {place}")
             }
-            Canvas::Demo { size: [w, h], at: [x, y], side } => {
-                write!(f, ", sampled to {w}×{h} at ({x}, {y}) of {side}×{side} as in the demo")
-            }
+            Canvas::Demo(place) => write!(f, ", sampled to {place} as in the demo"),
         }
     }
 }

@@ -4,13 +4,13 @@
 
 use burn::tensor::{Tensor, TensorData};
 use glam::{DMat3, DVec3};
-use snapsnap_net::gaussians::Origin;
 use snapsnap_net::network::View;
+use snapsnap_net::painter::Origin;
 use snapsnap_splat::{Camera, Gaussians, Orbit, RigidTransform, affine};
 
+use crate::exif_camera::Viewpoint;
 use crate::placing::Mapping;
-use crate::planes::PlaneMap;
-use crate::shot::Viewpoint;
+use crate::plane_map::PlaneMap;
 
 /// z of the body's axis, in metres.
 pub const AXIS: f64 = 0.0;

@@ -3,7 +3,7 @@
 
 use image::GrayImage;
 
-use super::Rect;
+use crate::rect::Rect;
 
 /// Largest number of cells along a side of the grid on which pieces are told apart.
 const CELLS: u32 = 512;

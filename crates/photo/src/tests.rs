@@ -1,7 +1,10 @@
 //! Tests of placement, soft edges and extreme sizes.
 
-use super::*;
+use std::path::Path;
+
 use image::{Rgba, RgbaImage};
+
+use super::*;
 
 const SIDE: usize = 256;
 
@@ -131,7 +134,7 @@ fn photographs_from_one_place_are_placed_together() {
         let mask = GrayImage::from_fn(size.0, size.1, |i, j| {
             image::Luma([if (x..x + 60).contains(&i) && (y..y + height).contains(&j) { 255 } else { 0 }])
         });
-        (RgbImage::from_fn(size.0, size.1, |i, j| image::Rgb([(i % 251) as u8, (j % 241) as u8, 9])), mask)
+        (RgbImage::from_fn(size.0, size.1, |i, j| Rgb([(i % 251) as u8, (j % 241) as u8, 9])), mask)
     };
     let rows = |canvas: &Photograph| {
         let set: Vec<usize> = (0..SIDE * SIDE).filter(|i| canvas.valid[*i]).collect();
@@ -187,7 +190,7 @@ fn rims_of_the_background_are_left_out_of_a_users_photographs() {
         assert!(greenish(&canvas) > 300 && report.rim == 0, "{placement:?}: {}", greenish(&canvas));
     }
     // Photographs in memory, as in training, are corrected as well.
-    let rgb = DynamicImage::from(picture.clone()).into_rgb8();
+    let rgb = image::DynamicImage::from(picture.clone()).into_rgb8();
     let mask = GrayImage::from_fn(side, side, |x, y| image::Luma([picture.get_pixel(x, y).0[3]]));
     let source = Source::pixels(Path::new("x"), &rgb, Some(&mask));
     let training =

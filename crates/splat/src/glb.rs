@@ -9,7 +9,7 @@ use std::io::{self, Read, Write};
 use serde_json::{Map, Value, json};
 
 use crate::sh;
-use crate::stored::{MIN_SCALE, Problem, Stored, logit, opacity};
+use crate::stored::{MIN_SCALE, Problem, Stored, logit, opacity, unit};
 
 /// First bytes of a file.
 pub(crate) const MAGIC: [u8; 2] = *b"gl";
@@ -122,9 +122,11 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
         };
         let is_rotation = name.ends_with("ROTATION");
         for i in 0..n {
-            let values = columns.iter().map(|column| activate(column[i]));
-            let values: Vec<f32> =
-                if is_rotation { unit(values.map(f64::from)).to_vec() } else { values.collect() };
+            let mut values: Vec<f32> = columns.iter().map(|column| activate(column[i])).collect();
+            if is_rotation {
+                let [w, x, y, z] = unit([values[3], values[0], values[1], values[2]]);
+                values = vec![x, y, z, w];
+            }
             values.iter().try_for_each(|value| out.write_all(&value.to_le_bytes()))?;
         }
     }
@@ -134,15 +136,6 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
         out.write_all(&color.map(|value| (255.0 * value).round() as u8))?;
     }
     Ok(())
-}
-
-/// A quaternion (x, y, z, w), normalised. A quaternion of length 0 becomes the identity.
-fn unit(values: impl Iterator<Item = f64>) -> [f32; 4] {
-    let values: Vec<f64> = values.collect();
-    let length = values.iter().map(|v| v * v).sum::<f64>().sqrt();
-    let part =
-        |i: usize| if length > 0.0 { (values[i] / length) as f32 } else { f32::from(u8::from(i == 3)) };
-    std::array::from_fn(part)
 }
 
 /// From sRGB to linear light (IEC 61966-2-1).

@@ -1,15 +1,16 @@
 //! Cameras, 3D Gaussians, their files and the differentiable rasteriser.
 
-pub mod adapter;
 mod camera;
-pub mod cameras;
+pub mod camera_file;
 mod error;
 mod gaussians;
 mod glb;
+pub mod graphics_api;
 mod linear;
 mod op;
 mod options;
 pub mod ply;
+mod projection;
 pub mod reference;
 mod render;
 pub mod scene;
@@ -17,11 +18,10 @@ pub mod sh;
 mod sog;
 mod spz;
 mod stored;
-mod vjp;
 
 pub use camera::{Camera, Orbit, RigidTransform};
 pub use error::SplatError;
 pub use gaussians::{Gaussians, affine};
-pub use op::{Counts, MAX_SIDE};
-pub use options::{MIN_ALPHA, MIN_TRANSMITTANCE, Preset, RenderOptions, TILE};
+pub use op::Counts;
+pub use options::{MAX_SIDE, MIN_ALPHA, MIN_TRANSMITTANCE, Preset, RenderOptions, TILE};
 pub use render::{Rendered, render};

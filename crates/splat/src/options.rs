@@ -5,6 +5,8 @@ use serde::{Deserialize, Serialize};
 
 /// Side of the square image tiles that share one list of splats, in pixels.
 pub const TILE: usize = 16;
+/// Largest image side; keeps pixel coordinates exact in f32 and tile numbers in 32 bits.
+pub const MAX_SIDE: u32 = 32_768;
 /// A splat is skipped at a pixel where its α is below this.
 pub const MIN_ALPHA: f32 = 1.0 / 255.0;
 /// A pixel is closed by the first splat that would bring its transmittance below this; the splat is not drawn.

@@ -25,8 +25,9 @@ pub struct Rendered {
 /// projections (EWA splatting; docs/method.md, "Splatting").
 ///
 /// Differentiable in means, rotations, scales, opacities, colours and background. Untracked inputs cost nothing in
-/// the backward pass. On one device, equal inputs give equal bits on every run, forward and backward. A Gaussian whose
-/// parameters are not finite or leave f32's range when projected is culled, counted, and gets a zero gradient.
+/// the backward pass. On one device, equal inputs give equal bits on every run, forward and backward; with a
+/// background, a GPU's first run may differ in the last bits, since it tunes Burn's sums. A Gaussian whose parameters
+/// are not finite or leave f32's range when projected is culled, counted, and gets a zero gradient.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};
@@ -59,30 +60,31 @@ pub fn render(
 ) -> Result<Rendered, SplatError> {
     let job = Job::new(cameras, options)?;
     gaussians.check()?;
-    let device = gaussians.device();
-    let background = match &options.background {
-        None => Tensor::<1>::zeros([3], &device),
-        Some(color) if color.dims() == [3] => color.clone(),
-        Some(color) => {
-            let found = color.dims().to_vec();
-            return Err(SplatError::Shape { field: "background", found, expected: vec![3] });
-        }
-    };
+    if let Some(color) = options.background.as_ref().filter(|color| color.dims() != [3]) {
+        let found = color.dims().to_vec();
+        return Err(SplatError::Shape { field: "background", found, expected: vec![3] });
+    }
     let inputs = SplatInputs {
         means: f32(&gaussians.means).into_dispatch(),
         rotations: f32(&gaussians.rotations).into_dispatch(),
         scales: f32(&gaussians.scales).into_dispatch(),
         opacities: f32(&gaussians.opacities).into_dispatch(),
         colors: f32(&gaussians.colors).into_dispatch(),
-        background: f32(&background).into_dispatch(),
     };
     let output = <Dispatch as SplatBackend>::splat(inputs, Arc::new(job));
     let counts = output.counts?;
-    let flat = |image| Tensor::<4>::from_dispatch(image).squeeze_dim::<3>(3);
+    let image: fn(_) -> Tensor<4> = Tensor::from_dispatch;
+    let (mut color, alpha) = (image(output.color), image(output.alpha));
+    // The operation renders over black.
+    if let Some(background) = &options.background {
+        let transmittance: Tensor<4> = 1.0 - alpha.clone();
+        // Expanded, so that gradients are sums over one dimension after the other, not over all at once.
+        color = color.clone() + transmittance * f32(background).reshape([1, 1, 1, 3]).expand(color.dims());
+    }
     Ok(Rendered {
-        color: Tensor::from_dispatch(output.color),
-        alpha: flat(output.alpha),
-        depth: options.depth.then(|| flat(output.depth)),
+        color,
+        alpha: alpha.squeeze_dim::<3>(3),
+        depth: options.depth.then(|| image(output.depth).squeeze_dim::<3>(3)),
         counts,
     })
 }

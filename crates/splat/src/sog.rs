@@ -11,7 +11,7 @@ use serde_json::json;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
-use crate::stored::{Stored, opacity};
+use crate::stored::{Stored, opacity, unit};
 
 /// Number of values in a codebook.
 const CODES: usize = 256;
@@ -136,9 +136,7 @@ fn picture(order: &[u32], [width, height]: [usize; 2], of: &dyn Fn(usize) -> [u8
 
 /// A quaternion (w, x, y, z): three bytes without the largest component, whose index is in the fourth byte.
 fn pack_smallest_three(q: [f32; 4]) -> [u8; 4] {
-    let q = q.map(f64::from);
-    let length = q.iter().map(|v| v * v).sum::<f64>().sqrt();
-    let q = if length > 0.0 { q.map(|v| (v / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };
+    let q = unit(q);
     let largest = (0..4).max_by(|a, b| q[*a].abs().total_cmp(&q[*b].abs())).expect("four components");
     // A quaternion and its negative are one rotation; the largest component becomes positive.
     let step =

@@ -12,7 +12,7 @@ use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 
-use crate::stored::{Problem, Stored};
+use crate::stored::{Problem, Stored, unit};
 
 /// First bytes of a gzip stream.
 pub(crate) const GZIP: [u8; 2] = [0x1f, 0x8b];
@@ -304,9 +304,7 @@ fn unpack_smallest_three(mut packed: u32) -> [f32; 4] {
 
 /// The inverse of [`unpack_smallest_three`]. Quaternions may have any length; length 0 becomes the identity.
 fn pack_smallest_three(wxyz: [f32; 4]) -> u32 {
-    let length = wxyz.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-    let [w, x, y, z] =
-        if length > 0.0 { wxyz.map(|v| (f64::from(v) / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] };
+    let [w, x, y, z] = unit(wxyz);
     let q = [x, y, z, w];
     let mut largest = 0;
     for i in 1..4 {

@@ -179,6 +179,12 @@ impl From<String> for Problem {
     }
 }
 
+/// A quaternion (w, x, y, z), normalised. A quaternion of length 0 becomes the identity.
+pub(crate) fn unit(q: [f32; 4]) -> [f32; 4] {
+    let length = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    if length > 0.0 { q.map(|v| (f64::from(v) / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] }
+}
+
 /// The opacity of a logit.
 pub(crate) fn opacity(logit: f32) -> f32 {
     1.0 / (1.0 + (-logit).exp())

@@ -12,7 +12,7 @@ use burn::module::{Module, Param, ParamGroup, ParamId};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Distribution, Tensor};
 use snapsnap_base::config::Schema;
-use snapsnap_net::network::{Grid, Input, PointPredictor};
+use snapsnap_net::network::{Input, PointPredictor};
 use snapsnap_net::precision::Precision;
 use snapsnap_net::regressor::Statistics;
 use snapsnap_net::weights::{NamedVisitor, ParameterPath, random_predictor, random_regressors, visit_named};
@@ -113,7 +113,7 @@ fn run(seconds: f64, side: usize, batch: usize) {
             continue;
         }
         let masters = frozen(masters.clone(), &trained.split(',').collect::<Vec<_>>());
-        let grid = Grid([side / config.network.patch; 2]);
+        let grid = [side / config.network.patch; 2];
         let time = measure(seconds, || {
             let start = Instant::now();
             let predictor = precision.lower(masters.clone());

@@ -7,7 +7,7 @@ use std::path::Path;
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use snapsnap_base::FileError;
-use snapsnap_net::weights::{Source, WeightsError, not_finite, write_tensors};
+use snapsnap_net::weights::{Float, Source, WeightsError, not_finite, write_tensors};
 use snapsnap_ops::host;
 
 use crate::identity::Identity;
@@ -48,7 +48,7 @@ pub(crate) fn save<T: Task>(
     // Only one row at a time is copied to the host.
     let rows: Vec<_> = rows.into_values().collect();
     let values = |i: usize| Ok(host(rows[i].clone()));
-    write_tensors(path, "the state of the training", metadata, names, values, &|_, _| ())
+    write_tensors(path, "the state of the training", metadata, names, Float::F32, values, &|_, _| ())
 }
 
 /// Restores a learner of the same networks from the state of a run, and returns the run's identity.
@@ -64,9 +64,6 @@ pub(crate) fn load<T: Task>(
         serde_json::from_str(text).map_err(|e| wrong(format!("{RECORD_KEY}: {e}")))?;
     if progress.stage != T::STAGE {
         return Err(wrong(format!("is of stage {}, not of stage {}", progress.stage, T::STAGE)));
-    }
-    if progress.loss_scale.is_some_and(|scale| !scale.is_sound()) {
-        return Err(wrong(format!("{RECORD_KEY}: loss_scale is out of range")));
     }
     let read = |name: &String| Ok((name.clone(), source.read_f32(name)?));
     let mut rows = source.tensors().keys().map(read).collect::<Result<BTreeMap<_, _>, WeightsError>>()?;
@@ -97,5 +94,5 @@ pub(crate) fn load<T: Task>(
     learner.networks = std::mem::take(&mut learner.networks).with_rows(&weights);
     learner.optimizer.restore(&learner.networks, &mut rows, &progress.times, device);
     learner.progress = progress;
-    Ok(run.current())
+    Ok(run.current(learner.config))
 }

@@ -42,7 +42,7 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
             }
             training.push(new(folder.clone(), Some(Split::Train), samples.clone())?);
         }
-        let wanted = Some(config.training.validate_on.split());
+        let wanted = Some(Split::Val);
         let wished = config.training.validation_samples;
         let (mut there, mut people) = (Vec::new(), 0);
         for folder in folders.iter().filter(|folder| wished > 0 && folder.splits().contains(&wanted)) {

@@ -28,17 +28,6 @@ pub fn collect(networks: &Networks, gradients: &mut Gradients) -> Rows {
     collect.rows
 }
 
-/// Adds the gradients of a batch to the sum of the earlier batches.
-pub fn add(sum: &mut Rows, gradients: Rows) {
-    for (name, gradient) in gradients {
-        let total = match sum.remove(&name) {
-            Some(total) => total + gradient,
-            None => gradient,
-        };
-        sum.insert(name, total);
-    }
-}
-
 /// Sums of all ranks' gradients, on a device. A rank may lack some gradients. `lengths` are the numbers of values of
 /// all parameters, which are the same on all ranks.
 pub fn reduce(

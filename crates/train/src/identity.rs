@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use snapsnap_base::FileError;
-use snapsnap_base::config::{differences, is_gone, keys};
+use snapsnap_base::config::{Schema, differences, is_gone, keys};
 use snapsnap_data::dataset::Split::{self, Train, Val};
 
 use crate::TrainError;
@@ -14,12 +14,10 @@ use crate::task::Task;
 
 /// Keys that may change between the sessions of a run: its length, its reports, the speed of its loader, and paths. The
 /// files behind the paths have hashes of their own, or are no longer read.
-const FREE: [&str; 10] = [
+const FREE: [&str; 8] = [
     "data.folders",
-    "stage2.lpips.files",
     "training.checkpoint_every",
     "training.log_every",
-    "training.prefetch",
     "training.preview_every",
     "training.steps",
     "training.validate_every",
@@ -30,9 +28,9 @@ const FREE: [&str; 10] = [
 const NETWORKS: [&str; 3] = ["network.", "regressor.", "mode."];
 
 /// Prefixes of the keys that decide what a validation measures, besides the data.
-const VALIDATION: [&str; 3] = ["samples.", "training.validate_on", "training.validation_samples"];
-/// Prefixes of the keys of [`VALIDATION`] that affect training samples alone.
-const TRAINING_ALONE: [&str; 3] = ["samples.augment.", "samples.repeat", "samples.seed"];
+const VALIDATION: [&str; 2] = ["samples.", "training.validation_samples"];
+/// Prefix of the keys of [`VALIDATION`] that affect training samples alone.
+const TRAINING_ALONE: &str = "samples.augment.";
 
 /// Settings, data and frozen predictor of a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -54,7 +52,6 @@ impl Identity {
     /// # Errors
     /// [`TrainError::File`] if a file of a data set cannot be read.
     pub fn of<T: Task>(task: &T, config: &TrainConfig) -> Result<Self, TrainError> {
-        let validated = config.training.validate_on.split();
         let mut own = keys(config);
         own.retain(|key, _| !FREE.contains(&key.as_str()));
         let folders = &task.data().folders;
@@ -70,13 +67,14 @@ impl Identity {
             }
             format!("{:x}", hash.finalize())
         });
-        let (data, validated) = (fingerprints(&[Train, Val])?, fingerprints(&[validated])?);
+        let (data, validated) = (fingerprints(&[Train, Val])?, fingerprints(&[Val])?);
         Ok(Self { config: own, data, validated, predictor })
     }
 
-    /// This identity without the keys that the config no longer has.
-    pub fn current(mut self) -> Self {
-        self.config.retain(|key, value| !is_gone::<TrainConfig>(key, value));
+    /// This identity without the keys that the config no longer has, if they mean what `config` does.
+    pub fn current(mut self, config: &TrainConfig) -> Self {
+        self.config
+            .retain(|key, value| !is_gone::<TrainConfig>(key, value) || config.contradicts(key, value));
         self
     }
 
@@ -105,10 +103,9 @@ impl Identity {
 
     /// Whether scores of validations do not compare with those of the identity `there`.
     pub fn validates_otherwise(&self, there: &Self) -> bool {
-        let is_of = |key: &str, all: [&str; 3]| all.iter().any(|start| key.starts_with(start));
-        let is_other = differences(&there.config, &self.config)
-            .iter()
-            .any(|(key, _)| is_of(key, VALIDATION) && !is_of(key, TRAINING_ALONE));
+        let is_other = differences(&there.config, &self.config).iter().any(|(key, _)| {
+            VALIDATION.iter().any(|start| key.starts_with(start)) && !key.starts_with(TRAINING_ALONE)
+        });
         let has_others = match there.validated.is_empty() {
             true => there.data != self.data,
             false => there.validated != self.validated,

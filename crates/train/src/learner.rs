@@ -15,14 +15,18 @@ use crate::ema::Average;
 use crate::identity::Identity;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
-use crate::precision::{LossScale, Precision, lower};
+use crate::precision::lower;
 use crate::ranks::Ranks;
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
 
+/// Largest norm of all gradients together, as published. Larger gradients are scaled down to it.
+const MAX_NORM: f64 = 1.0;
+/// Batches that are loaded in advance.
+const PREFETCH: usize = 2;
+
 /// Progress of a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Progress {
     /// Stage of the training, 1 or 2.
     pub stage: u32,
@@ -37,8 +41,6 @@ pub struct Progress {
     /// Step after which the final validation and preview were made; 0 before.
     #[serde(default)]
     pub shown: u64,
-    /// Scale of the loss, in f16.
-    pub loss_scale: Option<LossScale>,
     /// Number of AdamW's steps by parameter.
     pub times: BTreeMap<String, u64>,
 }
@@ -77,7 +79,7 @@ impl<'a, T: Task> Learner<'a, T> {
             task,
             config,
             average: (share > 0.0).then(|| Average::new(share, networks.rows())),
-            optimizer: config.optimizer.init(),
+            optimizer: config.optimizer.init(config.mode.compat),
             lengths: lengths.collect(),
             networks,
             progress: Progress { stage: T::STAGE, ..Progress::default() },
@@ -150,48 +152,41 @@ impl<'a, T: Task> Learner<'a, T> {
     }
 
     fn update(&mut self, step: u64) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
-        let t = &self.config.training;
-        let scale = &mut self.progress.loss_scale;
-        *scale = (self.config.training.precision == Precision::F16).then(|| scale.unwrap_or_default());
-        let scale = scale.map_or(1.0, |scale| scale.factor);
-        let (mut sum, mut values) = (Rows::new(), BTreeMap::<String, f64>::new());
-        let mut names: Vec<String> = Vec::new();
-        for batch in 0..t.accumulate {
-            let Loaded { items, first, count } = match self.load(step * t.accumulate as u64 + batch as u64) {
-                Ok(loaded) => loaded,
-                // The reason names the damaged file.
-                Err(why) => return Ok(Err(why)),
-            };
-            let share = items.len() as f64 / (count * t.accumulate) as f64;
-            names.extend(items.iter().map(|item| T::name(item).to_owned()));
-            // The whole batch decides on the window.
-            let extents = self.ranks.gather(&self.task.extent(&items)).into_iter().flatten();
-            let extent = extents.reduce(|all, extent| all.united(&extent));
-            let at = Moment { step, batch: batch as u64, first, extent };
-            let how = How { precision: self.config.training.precision, scale, share };
-            let (made, failed) = match self.losses(items, at, how) {
-                // A scene that the rasteriser refuses costs the step, not the run.
-                Err(TrainError::Splat(e)) => (Err(e.to_string()), None),
-                Err(e) => (Err(String::new()), Some(e)),
-                Ok(Made { gradients: None, .. }) => (Err("the loss is not finite".to_owned()), None),
-                Ok(Made { values, gradients: Some(gradients) }) => {
-                    gradients::add(&mut sum, gradients);
-                    let named = values.into_iter().map(|(name, value)| (name.to_owned(), value));
-                    (Ok(named.collect::<BTreeMap<_, _>>()), None)
-                }
-            };
-            self.ranks.agree(failed)?;
-            let everywhere = self.ranks.gather(&made.map_err(|why| of_samples(&why, &names)));
-            let everywhere = match everywhere.into_iter().collect::<Result<Vec<_>, Skipped>>() {
-                Ok(everywhere) => everywhere,
-                Err(why) => return Ok(Err(why)),
-            };
-            if everywhere.iter().all(BTreeMap::is_empty) {
-                return Ok(Err(self.everywhere("the point predictor finds no pixel of a person", names)));
+        let Loaded { items, first, count } = match self.load(step) {
+            Ok(loaded) => loaded,
+            // The reason names the damaged file.
+            Err(why) => return Ok(Err(why)),
+        };
+        let share = items.len() as f64 / count as f64;
+        let names: Vec<String> = items.iter().map(|item| T::name(item).to_owned()).collect();
+        // The whole batch decides on the window.
+        let extents = self.ranks.gather(&self.task.extent(&items)).into_iter().flatten();
+        let extent = extents.reduce(|all, extent| all.united(&extent));
+        let (made, failed) = match self.losses(items, Moment { step, first, extent }, share) {
+            // A scene that the rasteriser refuses costs the step, not the run.
+            Err(TrainError::Splat(e)) => (Err(e.to_string()), None),
+            Err(e) => (Err(String::new()), Some(e)),
+            Ok(Made { gradients: None, .. }) => (Err("the loss is not finite".to_owned()), None),
+            Ok(Made { values, gradients: Some(gradients) }) => (Ok((values, gradients)), None),
+        };
+        self.ranks.agree(failed)?;
+        let (named, sum) = match made {
+            Ok((values, gradients)) => {
+                let named = values.into_iter().map(|(name, value)| (name.to_owned(), value));
+                (Ok(named.collect::<BTreeMap<_, _>>()), gradients)
             }
-            for (name, value) in everywhere.into_iter().flatten() {
-                *values.entry(name).or_default() += value;
-            }
+            Err(why) => (Err(of_samples(&why, &names)), Rows::new()),
+        };
+        let everywhere = match self.ranks.gather(&named).into_iter().collect::<Result<Vec<_>, Skipped>>() {
+            Ok(everywhere) => everywhere,
+            Err(why) => return Ok(Err(why)),
+        };
+        if everywhere.iter().all(BTreeMap::is_empty) {
+            return Ok(Err(self.everywhere("the point predictor finds no pixel of a person", names)));
+        }
+        let mut values = BTreeMap::<String, f64>::new();
+        for (name, value) in everywhere.into_iter().flatten() {
+            *values.entry(name).or_default() += value;
         }
         let since = Instant::now();
         let device = self.optimizer.device(self.device.clone().inner());
@@ -200,14 +195,10 @@ impl<'a, T: Task> Learner<'a, T> {
             values.insert("reduce_ms".to_owned(), 1e3 * since.elapsed().as_secs_f64());
         }
         let norm = gradients::norm(&sum);
-        let clipped = gradients::clip_factor(norm, t.clip);
-        if let Some(scale) = &mut self.progress.loss_scale {
-            scale.update(clipped.is_some());
-        }
-        let Some(factor) = clipped else {
+        let Some(factor) = gradients::clip_factor(norm, MAX_NORM) else {
             return Ok(Err(self.everywhere("a gradient is not finite", names)));
         };
-        let share = self.config.schedule.share(step as usize, t.steps);
+        let share = self.config.schedule.share(step as usize, self.config.training.steps);
         let rows = self.optimizer.step(share, &self.networks, sum, factor);
         self.networks = std::mem::take(&mut self.networks).with_rows(&rows);
         if let Some(average) = &mut self.average {
@@ -223,19 +214,14 @@ impl<'a, T: Task> Learner<'a, T> {
         of_samples(why, &self.ranks.gather(&names).concat())
     }
 
-    /// Losses and gradients of a part of a batch, times its share.
-    fn losses(
-        &self,
-        items: Vec<T::Item>,
-        at: Moment,
-        How { precision, scale, share }: How,
-    ) -> Result<Made, TrainError> {
+    /// Losses and gradients of a part of a batch, times the part's share of the batch.
+    fn losses(&self, items: Vec<T::Item>, at: Moment, share: f64) -> Result<Made, TrainError> {
         let nothing = Made { values: BTreeMap::new(), gradients: Some(Rows::new()) };
         // There may be more ranks than samples in the last batch of a pass.
         if items.is_empty() {
             return Ok(nothing);
         }
-        let parts = self.task.losses(&lower(precision, &self.networks), items, at)?;
+        let parts = self.task.losses(&lower(self.config.training.precision, &self.networks), items, at)?;
         if parts.is_empty() {
             return Ok(nothing);
         }
@@ -249,13 +235,9 @@ impl<'a, T: Task> Learner<'a, T> {
         if !total.is_finite() {
             return Ok(Made { values, gradients: None });
         }
-        let weighted = parts.into_iter().map(|part| part.value * (part.weight * share * scale)).collect();
+        let weighted = parts.into_iter().map(|part| part.value * (part.weight * share)).collect();
         let mut tracked = Tensor::cat(weighted, 0).sum().backward();
-        let mut rows = gradients::collect(&self.networks, &mut tracked);
-        if scale != 1.0 {
-            rows.values_mut().for_each(|row| *row = row.clone() / scale);
-        }
-        Ok(Made { values, gradients: Some(rows) })
+        Ok(Made { values, gradients: Some(gradients::collect(&self.networks, &mut tracked)) })
     }
 
     /// This rank's part of a batch of the run, or the reason why any rank cannot load its part.
@@ -278,16 +260,6 @@ fn of_samples(why: &str, names: &[String]) -> Skipped {
 struct Made {
     values: BTreeMap<&'static str, f64>,
     gradients: Option<Rows>,
-}
-
-/// Numerical settings of a batch.
-#[derive(Debug, Clone, Copy)]
-struct How {
-    precision: Precision,
-    /// Factor of the loss, by which its gradients are divided.
-    scale: f64,
-    /// The batch's share of its step.
-    share: f64,
 }
 
 /// Samples of this rank's part of a batch.
@@ -322,9 +294,10 @@ impl<'a, T: Task> Samples<'a, T> {
         let (pass, place) = (number / per_pass, (number % per_pass) as usize);
         let mut open = self.open.take().filter(|(_, next)| *next == number && place > 0);
         let (batches, next) = open.get_or_insert_with(|| {
-            let loader = Loader::new(self.task.data().pass(pass), t.batch, t.workers, t.prefetch);
+            let loader = Loader::new(self.task.data().pass(pass), t.batch, t.workers, PREFETCH);
             let loader = loader.part(ranks.rank(), ranks.size());
-            let loader = if t.shuffle { loader.shuffled(t.seed) } else { loader };
+            // The published code takes people in order.
+            let loader = if self.config.mode.compat { loader } else { loader.shuffled(t.seed) };
             (loader.batches(pass, place), number)
         });
         *next += 1;

@@ -13,6 +13,14 @@ use crate::networks::{Networks, Parameter, Rows, moved, row};
 
 /// Values per task of a step on the CPU.
 const PIECE: usize = 1 << 14;
+/// AdamW: decay of the gradients' mean, the value that is added to the root of the mean of squared gradients, and the
+/// share of a weight that a step at rate 1 would remove. All three are the published ones.
+pub(crate) const BETA1: f64 = 0.9;
+pub(crate) const EPSILON: f64 = 1e-8;
+pub(crate) const WEIGHT_DECAY: f64 = 0.05;
+/// Muon: share of the former velocity in the direction of a step, and of a weight that a step at rate 1 would remove.
+const MUON_MOMENTUM: f64 = 0.95;
+pub(crate) const MUON_WEIGHT_DECAY: f64 = 0.02;
 
 /// The section `[optimizer]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -20,16 +28,8 @@ const PIECE: usize = 1 << 14;
 pub struct OptimizerConfig {
     /// Highest learning rate of AdamW.
     pub rate: f64,
-    /// Decay of the gradients' mean.
-    pub beta1: f64,
     /// Decay of the mean of squared gradients.
     pub beta2: f64,
-    /// Added to the root of the mean of squared gradients.
-    pub epsilon: f64,
-    /// Share of a weight that a step at rate 1 would remove.
-    pub weight_decay: f64,
-    /// Whether norms, biases and δ decay as well. They do in the published code.
-    pub decay_all: bool,
     /// Muon for hidden matrices and kernels.
     pub muon: Option<MuonSettings>,
 }
@@ -40,30 +40,18 @@ pub struct OptimizerConfig {
 pub struct MuonSettings {
     /// Highest learning rate. Updates are scaled to the size of AdamW's updates.
     pub rate: f64,
-    /// Share of the former velocity in the direction of a step.
-    pub momentum: f64,
-    /// Share of a weight that a step at rate 1 would remove.
-    pub weight_decay: f64,
 }
 
 impl Default for OptimizerConfig {
     /// The published optimiser.
     fn default() -> Self {
-        Self {
-            rate: 1e-4,
-            beta1: 0.9,
-            beta2: 0.999,
-            epsilon: 1e-8,
-            weight_decay: 0.05,
-            decay_all: true,
-            muon: None,
-        }
+        Self { rate: 1e-4, beta2: 0.999, muon: None }
     }
 }
 
 impl Default for MuonSettings {
     fn default() -> Self {
-        Self { rate: 1e-3, momentum: 0.95, weight_decay: 0.02 }
+        Self { rate: 1e-3 }
     }
 }
 
@@ -71,27 +59,15 @@ impl OptimizerConfig {
     /// The first key that makes no sense, and why.
     pub fn problem(&self) -> Option<(&'static str, String)> {
         let muon = self.muon.clone().unwrap_or_default();
-        let shares = [
-            ("rate", self.rate, 10.0),
-            ("beta1", self.beta1, 1.0),
-            ("beta2", self.beta2, 1.0),
-            ("epsilon", self.epsilon, 1.0),
-            ("weight_decay", self.weight_decay, 10.0),
-            ("muon.rate", muon.rate, 10.0),
-            ("muon.momentum", muon.momentum, 1.0),
-            ("muon.weight_decay", muon.weight_decay, 10.0),
-        ];
-        if self.epsilon < 1e-30 {
-            return Some(("epsilon", format!("is {}, must be at least 1e-30", self.epsilon)));
-        }
+        let shares = [("rate", self.rate, 10.0), ("beta2", self.beta2, 1.0), ("muon.rate", muon.rate, 10.0)];
         let (key, value, limit) =
             shares.into_iter().find(|(_, value, limit)| !(0.0..*limit).contains(value))?;
         Some((key, format!("is {value}, must be at least 0 and less than {limit}")))
     }
 
-    /// An optimiser before its first step.
-    pub fn init(&self) -> Optimizer {
-        Optimizer { config: self.clone(), states: BTreeMap::new() }
+    /// An optimiser before its first step. With `decays_all`, norms, biases and δ decay as well, as in the published code.
+    pub fn init(&self, decays_all: bool) -> Optimizer {
+        Optimizer { config: self.clone(), decays_all, states: BTreeMap::new() }
     }
 }
 
@@ -106,6 +82,7 @@ pub(crate) enum State {
 /// An optimiser with its state.
 pub struct Optimizer {
     config: OptimizerConfig,
+    decays_all: bool,
     states: BTreeMap<String, State>,
 }
 
@@ -182,7 +159,7 @@ impl Optimizer {
                 (values, State::Muon { velocity })
             }
             _ => {
-                let decays = shape.len() >= 2 || self.config.decay_all;
+                let decays = shape.len() >= 2 || self.decays_all;
                 self.adamw(share, decays, values, gradient, factor, state)
             }
         }
@@ -199,7 +176,7 @@ impl Optimizer {
         factor: f64,
         state: Option<State>,
     ) -> (Tensor<1>, State) {
-        let OptimizerConfig { beta1, beta2, epsilon, .. } = self.config;
+        let (beta1, beta2, epsilon) = (BETA1, self.config.beta2, EPSILON);
         let device = values.device();
         let (time, mean, squares) = match state {
             Some(State::AdamW { time, mean, squares }) => {
@@ -208,7 +185,7 @@ impl Optimizer {
             _ => (1, gradient.zeros_like(), gradient.zeros_like()),
         };
         let rate = share * self.config.rate;
-        let kept = 1.0 - if decays { rate * self.config.weight_decay } else { 0.0 };
+        let kept = 1.0 - if decays { rate * WEIGHT_DECAY } else { 0.0 };
         let corrections = [beta1, beta2].map(|beta| 1.0 - beta.powf(time as f64));
         let (pace, root) = (rate / corrections[0], corrections[1].sqrt().recip());
         if device == Device::flex() {
@@ -290,13 +267,13 @@ fn muon(
     velocity: Option<Tensor<1>>,
     [rows, columns]: [usize; 2],
 ) -> (Tensor<1>, Tensor<1>) {
-    let (device, momentum) = (values.device(), settings.momentum);
+    let device = values.device();
     let rate = share * settings.rate;
-    let kept = 1.0 - rate * settings.weight_decay;
+    let kept = 1.0 - rate * MUON_WEIGHT_DECAY;
     let pace = rate * 0.2 * (rows.max(columns) as f64).sqrt();
     let mut velocity = velocity.map_or_else(|| vec![0.0; rows * columns], host);
     let (mut values, mut direction) = (host(values), host(gradient));
-    let [momentum, factor, kept, pace] = [momentum, factor, kept, pace].map(|value| value as f32);
+    let [momentum, factor, kept, pace] = [MUON_MOMENTUM, factor, kept, pace].map(|value| value as f32);
     for (velocity, gradient) in velocity.iter_mut().zip(&mut direction) {
         *gradient *= factor;
         *velocity = *velocity * momentum + *gradient;
@@ -333,11 +310,11 @@ mod tests {
     /// Burn's Muon takes matrices only.
     #[test]
     fn muon_is_burns() {
-        let settings = MuonSettings { rate: 0.01, momentum: 0.9, weight_decay: 0.02 };
-        let momentum = MomentumConfig { momentum: 0.9, dampening: 0.0, nesterov: true };
+        let settings = MuonSettings { rate: 0.01 };
+        let momentum = MomentumConfig { momentum: MUON_MOMENTUM, dampening: 0.0, nesterov: true };
         let burns = MuonConfig::new()
             .with_momentum(momentum)
-            .with_weight_decay(Some(WeightDecayConfig { penalty: 0.02 }))
+            .with_weight_decay(Some(WeightDecayConfig { penalty: MUON_WEIGHT_DECAY as f32 }))
             .with_adjust_lr_fn(AdjustLrFn::MatchRmsAdamW)
             .build();
         let device = Device::flex();
@@ -368,7 +345,7 @@ mod tests {
         let [host, other] = devices.map(|device| {
             let predictor = random_predictor(&crate::stability::config(&[]).networks(), 1, &device);
             let mut networks = Networks { predictor: Some(predictor), regressors: Vec::new() };
-            let mut optimizer = config.init();
+            let mut optimizer = config.init(true);
             for step in 1..3 {
                 let gradients = networks.rows().into_iter().map(|(name, values)| (name, values * step));
                 let rows = optimizer.step(1.0, &networks, gradients.collect(), 0.5);

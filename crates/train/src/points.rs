@@ -8,6 +8,8 @@ use snapsnap_ops::{mean, mean_lengths};
 use crate::config::Stage1Config;
 use crate::task::Part;
 
+/// λ: the weight of the confidences' cross-entropy, as in the published code. The paper has 1.
+const CONFIDENCE_WEIGHT: f64 = 0.5;
 /// Distances in pixels between which the relief is compared.
 const SPACINGS: [usize; 4] = [1, 2, 4, 8];
 /// Lower limit of probabilities: the smallest normal f32. (PyTorch's binary cross-entropy has e⁻¹⁰⁰.) Smaller
@@ -29,10 +31,10 @@ pub struct Losses {
 impl Losses {
     /// The losses with their weights.
     pub fn parts(self, config: &Stage1Config) -> Vec<Part> {
-        let Stage1Config { confidence_weight, relief_weight } = *config;
+        let Stage1Config { relief_weight } = *config;
         let mut parts = vec![
             Part { name: "points", weight: 1.0, value: self.regression },
-            Part { name: "confidence", weight: confidence_weight, value: self.confidence },
+            Part { name: "confidence", weight: CONFIDENCE_WEIGHT, value: self.confidence },
         ];
         parts.extend(self.relief.map(|value| Part { name: "relief", weight: relief_weight, value }));
         parts

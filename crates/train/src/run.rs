@@ -143,17 +143,13 @@ pub fn rehearse<T: Task>(
     let mut learner = Learner::new(task, config, networks, device, ranks);
     learner.compare(&Identity::of(task, config)?)?;
     let mut start = Instant::now();
-    let (mut made, mut failed) = (0, 0);
+    let mut made = 0;
     while made < STEPS[0] + STEPS[1] {
         if made == STEPS[0] {
             start = Instant::now();
         }
         match learner.step()? {
             Ok(_) => made += 1,
-            // In f16, the first steps reduce the loss scale.
-            Err(_) if learner.progress.loss_scale.is_some() && failed < MAX_FAILURES => {
-                (made, failed) = (0, failed + 1);
-            }
             Err(skipped) => {
                 return Err(TrainError::Unsuitable(format!("no step can be made: {skipped}")));
             }
@@ -323,7 +319,7 @@ impl<'a, T: Task> Session<'a, T> {
         let rate = (step - self.logged.1) as f64 / (now - self.logged.0).as_secs_f64().max(1e-9);
         self.logged = (now, step);
         values.insert("steps_per_second".to_owned(), rate);
-        values.insert("samples_per_second".to_owned(), rate * (t.batch * t.accumulate) as f64);
+        values.insert("samples_per_second".to_owned(), rate * t.batch as f64);
         let line = Line { step, seconds: self.seconds(), values };
         self.watch.step(&line, t.steps as u64, self.learner.progress.skipped);
         self.add(line)

@@ -3,7 +3,15 @@
 use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
-use snapsnap_base::config::outside;
+
+/// One cycle, as published: the number of steps by which the cycle is longer than the run, the share of the steps in
+/// which the rate rises, the highest rate divided by the first, and the first rate divided by the last.
+const OVERHANG: usize = 100;
+const RISE: f64 = 0.01;
+const START_DIVISOR: f64 = 25.0;
+const END_DIVISOR: f64 = 1e4;
+/// The last rate of the other schedules, divided by the highest.
+const END: f64 = 0.01;
 
 /// A schedule as a share of the highest rate: the section `[schedule]`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -11,22 +19,11 @@ use snapsnap_base::config::outside;
 pub enum Schedule {
     /// PyTorch's `OneCycleLR` with cosine annealing, as in the published code
     /// (docs/method.md, "Optimisation and schedules").
-    OneCycle {
-        /// Number of steps by which the cycle is longer than the run.
-        overhang: usize,
-        /// Share of the steps in which the rate rises.
-        rise: f64,
-        /// The highest rate divided by the first.
-        start_divisor: f64,
-        /// The first rate divided by the last.
-        end_divisor: f64,
-    },
+    OneCycle {},
     /// A linear rise, then half a cosine.
     Cosine {
         /// Steps in which the rate rises.
         warm_up: usize,
-        /// The last rate divided by the highest.
-        end: f64,
     },
     /// A linear rise, the highest rate, and a linear fall ("warmup-stable-decay"). While the rate is constant, it does
     /// not depend on the number of steps, so that a run's end can be set later.
@@ -35,15 +32,13 @@ pub enum Schedule {
         warm_up: usize,
         /// Last steps, in which the rate falls.
         fall: usize,
-        /// The last rate divided by the highest.
-        end: f64,
     },
 }
 
 impl Default for Schedule {
     /// The schedule of the published code.
     fn default() -> Self {
-        Self::OneCycle { overhang: 100, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 }
+        Self::OneCycle {}
     }
 }
 
@@ -51,19 +46,14 @@ impl Schedule {
     /// The first key that makes no sense in a run of `steps`, and why.
     pub fn problem(&self, steps: usize) -> Option<(&'static str, String)> {
         match *self {
-            Self::OneCycle { rise, start_divisor, end_divisor, .. } => outside([
-                ("rise", rise, 0.0..=1.0),
-                ("start_divisor", start_divisor, 1.0..=1e12),
-                ("end_divisor", end_divisor, 1.0..=1e12),
-            ]),
-            Self::Cosine { warm_up, .. } if warm_up > steps => {
+            Self::Cosine { warm_up } if warm_up > steps => {
                 Some(("warm_up", format!("is {warm_up}, must be at most `training.steps` ({steps})")))
             }
-            Self::Trapezoid { warm_up, fall, .. } if warm_up.saturating_add(fall) > steps => {
+            Self::Trapezoid { warm_up, fall } if warm_up.saturating_add(fall) > steps => {
                 let message = format!("is {fall}, with `warm_up` must be at most `training.steps` ({steps})");
                 Some(("fall", message))
             }
-            Self::Cosine { end, .. } | Self::Trapezoid { end, .. } => outside([("end", end, 0.0..=1.0)]),
+            _ => None,
         }
     }
 
@@ -73,31 +63,31 @@ impl Schedule {
             to + (from - to) / 2.0 * (1.0 + (PI * progress.clamp(0.0, 1.0)).cos())
         };
         let steps = match self {
-            Self::OneCycle { overhang, .. } => steps + overhang,
+            Self::OneCycle {} => steps + OVERHANG,
             Self::Cosine { .. } | Self::Trapezoid { .. } => steps,
         };
         let at = step.min(steps.saturating_sub(1)) as f64;
         match *self {
-            Self::OneCycle { rise, start_divisor, end_divisor, .. } => {
-                let start = 1.0 / start_divisor;
-                let peak = rise * steps as f64 - 1.0;
+            Self::OneCycle {} => {
+                let start = 1.0 / START_DIVISOR;
+                let peak = RISE * steps as f64 - 1.0;
                 if at < peak {
                     return anneal(start, 1.0, at / peak);
                 }
                 let fall = (steps as f64 - 1.0 - peak).max(f64::MIN_POSITIVE);
-                anneal(1.0, start / end_divisor, (at - peak) / fall)
+                anneal(1.0, start / END_DIVISOR, (at - peak) / fall)
             }
-            Self::Cosine { warm_up, .. } | Self::Trapezoid { warm_up, .. } if at < warm_up as f64 => {
+            Self::Cosine { warm_up } | Self::Trapezoid { warm_up, .. } if at < warm_up as f64 => {
                 (at + 1.0) / (warm_up as f64 + 1.0)
             }
-            Self::Cosine { warm_up, end } => {
+            Self::Cosine { warm_up } => {
                 let fall = (steps.saturating_sub(1).saturating_sub(warm_up)).max(1) as f64;
-                anneal(1.0, end, (at - warm_up as f64) / fall)
+                anneal(1.0, END, (at - warm_up as f64) / fall)
             }
             Self::Trapezoid { fall: 0, .. } => 1.0,
-            Self::Trapezoid { fall, end, .. } => {
+            Self::Trapezoid { fall, .. } => {
                 let left = steps.saturating_sub(1) as f64 - at;
-                end + (1.0 - end) * (left / fall as f64).min(1.0)
+                END + (1.0 - END) * (left / fall as f64).min(1.0)
             }
         }
     }
@@ -115,27 +105,23 @@ mod tests {
         assert!((rate(0) - 4e-6).abs() < 1e-12);
         assert!((rate(1000) - 1e-4).abs() < 1e-12);
         assert!((rate(100_099) - 4e-10).abs() < 1e-14 && (rate(200_000) - 4e-10).abs() < 1e-14);
-        let short = |step| {
-            let schedule =
-                Schedule::OneCycle { overhang: 0, rise: 0.01, start_divisor: 25.0, end_divisor: 1e4 };
-            schedule.share(step, 100)
-        };
-        assert!((0..100).all(|step| short(step).is_finite()) && (short(0) - 1.0).abs() < 1e-12);
+        let short = |step| schedule.share(step, 100);
+        assert!((0..200).all(|step| short(step).is_finite()) && short(1) > short(0));
         assert!(rate(500) > rate(400) && rate(50_000) > rate(60_000));
     }
 
     #[test]
     fn cosine_has_its_first_highest_and_last_rate() {
-        let share = |step| Schedule::Cosine { warm_up: 99, end: 1e-3 }.share(step, 1000);
+        let share = |step| Schedule::Cosine { warm_up: 99 }.share(step, 1000);
         assert!((share(0) - 0.01).abs() < 1e-12 && (share(98) - 0.99).abs() < 1e-12);
-        assert!((share(99) - 1.0).abs() < 1e-12 && (share(999) - 1e-3).abs() < 1e-12);
-        let short = |step| Schedule::Cosine { warm_up: 0, end: 0.1 }.share(step, 1);
+        assert!((share(99) - 1.0).abs() < 1e-12 && (share(999) - 0.01).abs() < 1e-12);
+        let short = |step| Schedule::Cosine { warm_up: 0 }.share(step, 1);
         assert!(short(0).is_finite() && short(7).is_finite());
     }
 
     #[test]
     fn trapezoid_is_constant_until_it_falls() {
-        let schedule = Schedule::Trapezoid { warm_up: 9, fall: 100, end: 0.01 };
+        let schedule = Schedule::Trapezoid { warm_up: 9, fall: 100 };
         let share = |step| schedule.share(step, 1000);
         assert!((share(0) - 0.1).abs() < 1e-12 && (share(8) - 0.9).abs() < 1e-12);
         assert!((9..900).all(|step| share(step) == 1.0), "constant");
@@ -148,9 +134,9 @@ mod tests {
         assert_eq!(schedule.share(500, 100_000), share(500), "whatever the number of steps");
         assert_eq!(schedule.problem(1000), None);
         assert_eq!(schedule.problem(108).map(|(key, _)| key), Some("fall"));
-        let endless = Schedule::Trapezoid { warm_up: 1, fall: usize::MAX, end: 0.01 };
+        let endless = Schedule::Trapezoid { warm_up: 1, fall: usize::MAX };
         assert_eq!(endless.problem(1000).map(|(key, _)| key), Some("fall"));
-        let step = Schedule::Trapezoid { warm_up: 0, fall: 0, end: 0.0 };
+        let step = Schedule::Trapezoid { warm_up: 0, fall: 0 };
         assert_eq!([0, 8, 9].map(|at| step.share(at, 10)), [1.0; 3]);
     }
 }

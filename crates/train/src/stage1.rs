@@ -49,11 +49,6 @@ impl PointTask {
     /// # Errors
     /// [`TrainError`] if a data set cannot be used with this config.
     pub fn new(folders: &[Arc<Folder>], config: &TrainConfig, device: &Device) -> Result<Self, TrainError> {
-        if config.network.second_layer && !config.samples.second_depth {
-            let why = "it gives the true second surfaces";
-            let message = format!("`samples.second_depth`: must be true with `network.second_layer`: {why}");
-            return Err(TrainError::Unsuitable(message));
-        }
         Ok(Self {
             networks: config.networks(),
             losses: config.stage1.clone(),

@@ -27,8 +27,6 @@ pub struct Part {
 pub struct Moment {
     /// Number of earlier steps.
     pub step: u64,
-    /// Number of earlier batches of this step.
-    pub batch: u64,
     /// Number of samples of the batch that lower ranks have.
     pub first: usize,
     /// The box around the people of the whole batch, as [`Task::extent`] finds it.

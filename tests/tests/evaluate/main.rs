@@ -12,7 +12,7 @@ use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 use serde_json::Value;
-use snapsnap_tests::{TRAINING, snapsnap, succeed};
+use snapsnap_tests::{TRAINING, root, snapsnap, succeed, synthetic_people};
 
 /// A data set of two test people and two training people, with eight views of 64². It is made once.
 fn people() -> &'static Path {
@@ -21,20 +21,7 @@ fn people() -> &'static Path {
         let folder =
             PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("tested-{}", std::process::id()));
         for split in ["test", "train"] {
-            let mut command = snapsnap();
-            command.args([
-                "prepare",
-                "synth",
-                "--seed",
-                "5",
-                "--subjects",
-                "2",
-                "--split",
-                split,
-                "--save-scans",
-            ]);
-            command.args(["--set", "views.count=8", "--set", "views.resolution=64", "-o"]).arg(&folder);
-            succeed(&mut command);
+            succeed(synthetic_people(&folder, split, 2, 8).arg("--save-scans"));
         }
         folder
     })
@@ -65,11 +52,18 @@ fn weights(seed: u32) -> PathBuf {
     file
 }
 
+/// An evaluation on data sets with the repository's config.
+fn evaluation(data: &[&Path], report: &Path) -> Command {
+    let mut command = snapsnap();
+    command.args(["--quiet", "evaluate", "--config"]).arg(root().join("configs/eval.toml"));
+    command.arg("--data").args(data).arg("-o").arg(report);
+    command
+}
+
 /// An evaluation on the CPU with random weights, unless `arguments` say otherwise.
 fn evaluate(data: &Path, report: &Path, arguments: &[&str]) -> Command {
-    let mut command = snapsnap();
-    command.args(["--quiet", "evaluate", "--config"]).arg(snapsnap_tests::root().join("configs/eval.toml"));
-    command.arg("--data").arg(data).args(arguments).arg("-o").arg(report);
+    let mut command = evaluation(&[data], report);
+    command.args(arguments);
     if !arguments.contains(&"--weights") {
         command.arg("--weights").arg(weights(1));
     }

@@ -1,10 +1,11 @@
 //! Meshes of other methods.
 
 use std::fs;
+use std::path::Path;
 
 use snapsnap_tests::{snapsnap, succeed};
 
-use super::{ended, evaluate, json, people};
+use super::{ended, evaluate, evaluation, json, people};
 
 #[test]
 fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
@@ -22,12 +23,8 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
         });
     fs::write(meshes.join("0001.obj"), lines.collect::<Vec<_>>().join("\n") + "\n").expect("writes");
     let run = |icp: &[&str]| {
-        let mut command = snapsnap();
-        command
-            .args(["--quiet", "evaluate", "--config"])
-            .arg(snapsnap_tests::root().join("configs/eval.toml"));
-        command.arg("--data").arg(people()).arg("--mesh-dir").arg(&meshes).args(icp);
-        let (code, said) = ended(command.arg("-o").arg(&report));
+        let mut command = evaluation(&[people()], &report);
+        let (code, said) = ended(command.arg("--mesh-dir").arg(&meshes).args(icp));
         assert!(code == Some(1) && said.contains("0000") && said.contains("has no mesh"), "{said}");
         let found = json(&report);
         assert_eq!(
@@ -56,10 +53,7 @@ fn scans_are_the_truth_where_they_are_given() {
     // Saved scans are in the world of the views. Measured against themselves they are not off.
     let saved = people().join("scans/test");
     let scans = format!("data.scans={:?}", saved.display().to_string());
-    let mut command = snapsnap();
-    command.args(["--quiet", "evaluate", "--config"]).arg(snapsnap_tests::root().join("configs/eval.toml"));
-    command.arg("--data").arg(people()).args(["--set", &scans, "--mesh-dir"]).arg(&saved);
-    succeed(command.arg("-o").arg(&report));
+    succeed(evaluation(&[people()], &report).args(["--set", &scans, "--mesh-dir"]).arg(&saved));
     let found = json(&report);
     let figure = |key: &str| found["geometry_cm"][key]["mean"].as_f64().expect("a number");
     for key in ["truth_to_surface", "surface_to_scan"] {
@@ -82,14 +76,7 @@ fn meshes_of_two_data_sets_are_told_apart() {
         scan.lines().filter(|line| !line.contains("mtl")).flat_map(|line| [line, "\n"]).collect();
     // A mesh that belongs to neither set.
     fs::write(meshes.join("0001.obj"), &scan).expect("writes");
-    let run = || {
-        let mut command = snapsnap();
-        command
-            .args(["--quiet", "evaluate", "--config"])
-            .arg(snapsnap_tests::root().join("configs/eval.toml"));
-        command.arg("--data").arg(people()).arg(&other).arg("--mesh-dir").arg(&meshes);
-        ended(command.arg("-o").arg(&report))
-    };
+    let run = || ended(evaluation(&[people(), &other], &report).arg("--mesh-dir").arg(&meshes));
     let (code, said) = run();
     assert!(code.is_some_and(|code| code != 0) && said.contains("has no mesh people/0001.obj"), "{said}");
     fs::write(meshes.join(set).join("0001.obj"), &scan).expect("writes");
@@ -106,10 +93,8 @@ fn meshes_of_two_data_sets_are_told_apart() {
     fs::create_dir(&around).expect("a folder");
     super::copied(&around);
     fs::write(meshes.join("around/people/0001.obj"), &scan).expect("writes");
-    let mut command = snapsnap();
-    command.current_dir(&around).args(["--quiet", "evaluate", "--config"]);
-    command.arg(snapsnap_tests::root().join("configs/eval.toml")).args(["--data", "people"]).arg(&other);
-    let (code, said) = ended(command.arg("--mesh-dir").arg(&meshes).arg("-o").arg(&report));
+    let mut command = evaluation(&[Path::new("people"), &other], &report);
+    let (code, said) = ended(command.current_dir(&around).arg("--mesh-dir").arg(&meshes));
     assert_eq!(code, Some(1), "{said}");
     assert_eq!(json(&report)["subjects"][0]["name"], "around/people/0001");
 }

@@ -372,7 +372,7 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     wrong(&["--set", "views.inputs=[1, 1]"], &["twice"]);
     wrong(&["--set", "views.resolution=48"], &["64", "48"]);
     wrong(&["--set", "ablations.model.sides=false"], &["`model`", "another meaning"]);
-    wrong(&["--set", "ablations.a.tune=\"all\""], &["ablations.a.tune", "only settings of"]);
+    wrong(&["--set", "ablations.a.knob=\"all\""], &["ablations.a.knob", "only settings of"]);
     wrong(&["--set", "ablations.a.stride=0"], &["ablations.a.stride", "1 to 64"]);
     wrong(&["--set", "model.devices=[\"cpu\", \"cpu\"]"], &["on cpu", "two ablations or devices"]);
     wrong(&["--set", "report.people=9"], &["report.people"]);

@@ -70,7 +70,7 @@ pub fn cases() -> impl Strategy<Value = Case> {
     let damage = prop_oneof![
         10 => (change::changes(), inside).prop_map(|(changes, part)| Damage::Changes(changes, part)),
         1 => (0.0..0.9).prop_map(Damage::Short),
-        1 => select(&instead[..]).prop_map(Damage::Instead),
+        1 => select(instead.to_vec()).prop_map(Damage::Instead),
     ];
     (any::<[Index; 2]>(), damage, any::<bool>(), prop::bool::weighted(0.03)).prop_map(
         |(target, damage, has_old_output, is_in_odd_folder)| Case {
@@ -126,6 +126,12 @@ impl Sample {
         files.map(|(path, _)| path).filter(|path| path.to_string_lossy().ends_with(end)).collect()
     }
 
+    /// The file that a case changes.
+    pub fn target(&self, format: &Format, case: &Case) -> &Path {
+        let targets = self.targets(format.changed[case.target[0].index(format.changed.len())]);
+        targets[case.target[1].index(targets.len())]
+    }
+
     fn bytes(&self, file: &Path) -> &[u8] {
         self.files[file].as_deref().expect("a file")
     }
@@ -146,8 +152,7 @@ impl Sample {
         }
         let (mut longer, mut is_short) = (0, false);
         if let Some(case) = case {
-            let targets = self.targets(case.target[0].get(&format.changed));
-            let target = *case.target[1].get(&targets);
+            let target = self.target(format, case);
             let path = inputs.join(target);
             match &case.damage {
                 Damage::Changes(changes, part) => {
@@ -174,7 +179,11 @@ impl Sample {
         }
         let inputs = inputs.file_name().expect("a name");
         let argument = |word: &str| match word.strip_prefix(INPUTS) {
-            Some(rest) if rest.is_empty() || rest.starts_with('/') => { let mut path = inputs.to_owned(); path.push(rest); path },
+            Some(rest) if rest.is_empty() || rest.starts_with('/') => {
+                let mut path = inputs.to_owned();
+                path.push(rest);
+                path
+            }
             _ => word.into(),
         };
         let arguments: Vec<OsString> = format.command.split_whitespace().map(argument).collect();
@@ -202,8 +211,11 @@ impl Sample {
             return envelope::close(ending, &parts);
         }
         let mut bytes = self.bytes(target).to_vec();
-        let siblings = self.files.iter().filter(|(path, content)| content.is_some() && path.extension() == target.extension());
-        let other = siblings.filter_map(|(_, content)| content.as_deref()).last().unwrap_or_default();
+        let siblings = self
+            .files
+            .iter()
+            .filter(|(path, content)| content.is_some() && path.extension() == target.extension());
+        let other = siblings.filter_map(|(_, content)| content.as_deref()).next_back().unwrap_or_default();
         changes.iter().for_each(|change| change.apply(&mut bytes, other));
         bytes
     }

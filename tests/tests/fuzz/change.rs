@@ -12,8 +12,22 @@ const HEAD: usize = 256;
 const BLOCK: usize = 64;
 /// Whole numbers at which sums, shifts, signs and allocations go wrong. The last two are both sides of a large picture.
 const WHOLE: [u64; 16] = [
-    0, 1, 2, 0x7f, 0x80, 0xff, 0x7fff, 0xffff,
-    1 << 31, (1 << 31) - 1, (1 << 32) - 1, u64::MAX, u64::MAX / 2, 1_000_000_000, 0x3e80_3e7f, 0x3e80_0000_3e7f,
+    0,
+    1,
+    2,
+    0x7f,
+    0x80,
+    0xff,
+    0x7fff,
+    0xffff,
+    1 << 31,
+    (1 << 31) - 1,
+    (1 << 32) - 1,
+    u64::MAX,
+    u64::MAX / 2,
+    1_000_000_000,
+    0x3e80_3e7f,
+    0x3e80_0000_3e7f,
 ];
 /// Numbers at which arithmetic goes wrong.
 const REAL: [f64; 8] =
@@ -55,9 +69,19 @@ impl Place {
 #[derive(Debug, Clone)]
 enum Binary {
     Cut(Place),
-    Overwrite { at: Place, aligned: bool, value: Vec<u8> },
+    Overwrite {
+        at: Place,
+        aligned: bool,
+        value: Vec<u8>,
+    },
     /// A block of this or another file takes the place of so many bytes.
-    Copy { from: Place, length: usize, to: Place, removed: usize, is_other: bool },
+    Copy {
+        from: Place,
+        length: usize,
+        to: Place,
+        removed: usize,
+        is_other: bool,
+    },
     /// The beginning of this file and the end of another.
     Join(Place, Place),
 }
@@ -99,12 +123,13 @@ fn binary() -> impl Strategy<Value = Binary> + Clone {
     let real = (select(&REAL[..]), any::<bool>()).prop_map(|(value, single)| {
         if single { (value as f32).to_le_bytes().to_vec() } else { value.to_le_bytes().to_vec() }
     });
-    let number = (prop_oneof![2 => whole, 1 => real], any::<bool>()).prop_map(|(mut bytes, is_big_endian)| {
-        if is_big_endian {
-            bytes.reverse();
-        }
-        bytes
-    });
+    let number =
+        (prop_oneof![2 => whole, 1 => real], any::<bool>()).prop_map(|(mut bytes, is_big_endian)| {
+            if is_big_endian {
+                bytes.reverse();
+            }
+            bytes
+        });
     let value = prop_oneof![
         4 => number,
         2 => vec(any::<u8>(), 1..=8),
@@ -164,7 +189,7 @@ impl Binary {
                 bytes[at..end].copy_from_slice(&value[..end - at]);
             }
             Self::Copy { from, length, to, removed, is_other } => {
-                let source = if *is_other { other } else { bytes };
+                let source: &[u8] = if *is_other { other } else { bytes };
                 let from = from.of(source);
                 let copy = source[from..(from + length).min(source.len())].to_vec();
                 let to = to.of(bytes);

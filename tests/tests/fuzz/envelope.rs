@@ -85,9 +85,7 @@ pub fn close(ending: &str, parts: &Parts) -> Vec<u8> {
             let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
             encoder.write_all(&parts[0].1).and_then(|()| encoder.finish()).expect("memory")
         }
-        "safetensors" => {
-            [&(parts[0].1.len() as u64).to_le_bytes()[..], &parts[0].1, &parts[1].1].concat()
-        }
+        "safetensors" => [&(parts[0].1.len() as u64).to_le_bytes()[..], &parts[0].1, &parts[1].1].concat(),
         _ => {
             let method =
                 if ending == "pth" { CompressionMethod::Stored } else { CompressionMethod::Deflated };

@@ -21,7 +21,7 @@ pub struct Format {
     pub is_whole: Check,
     /// Whether the command does what it can without the parts that it cannot read, names them, and ends with code 1.
     pub is_partial: bool,
-    /// Files that may be left though the input is refused.
+    /// Files and folders that may be left though the input is refused.
     pub kept: &'static [&'static str],
     /// Cases of a seed.
     pub share: u32,
@@ -31,7 +31,7 @@ pub struct Format {
 fn format(name: &'static str, sample: fn(&Path), changed: &'static str, command: &str) -> Format {
     let (command, changed) = (command.to_owned(), changed.split(' ').collect());
     let is_whole = |_: &Path| Ok(());
-    Format { name, sample, command, changed, file: None, is_whole, is_partial: false, kept: &[], share: 28 }
+    Format { name, sample, command, changed, file: None, is_whole, is_partial: false, kept: &[], share: 14 }
 }
 
 fn reconstruct(name: &'static str, sample: fn(&Path), changed: &'static str, arguments: &str) -> Format {
@@ -55,32 +55,35 @@ fn prepare(name: &'static str, sample: fn(&Path), changed: &'static str, argumen
 fn rehearsal(name: &'static str, arguments: &str) -> Format {
     let small = [
         "network.enc_depth=1",
-        "network.dec_depth=1",
-        "network.enc_dim=8",
-        "network.dec_dim=8",
-        "network.mlp_ratio=1",
-        "network.layer_dims=[2,2,2,2]",
-        "network.feature_dim=4",
-        "network.last_dim=2",
+        "network.dec_depth=2",
+        "network.enc_dim=16",
+        "network.dec_dim=16",
+        "network.layer_dims=[4,4,8,8]",
+        "network.hooks=[0,1,1,2]",
+        "network.feature_dim=8",
+        "network.last_dim=4",
         "training.batch=1",
-        "training.accumulate=1",
         "training.workers=1",
         "training.validation_samples=1",
         "samples.random_targets=1",
     ];
     let small: String = small.iter().map(|key| format!(" --set {key}")).collect();
     let command = format!("{arguments} --config in/t.toml --device cpu --dry-run{small}");
-    format(name, s::training, "t.toml", &command).share(20)
+    format(name, s::training, "t.toml", &command).share(10)
 }
 
-fn report(name: &'static str, changed: &'static str, command: &str) -> Format {
+fn report(name: &'static str, changed: &'static str, command: &str, is_whole: Check) -> Format {
     let format = format(name, s::evaluation, changed, &format!("{command} -o out"));
-    Format { is_partial: true, is_whole: s::report, share: 16, ..format }
+    Format { is_partial: true, is_whole, share: 8, ..format }
 }
 
 impl Format {
     fn writes(self, file: &'static str, is_whole: Check) -> Self {
         Self { file: Some(file), is_whole, ..self }
+    }
+
+    fn checked(self, is_whole: Check) -> Self {
+        Self { is_whole, ..self }
     }
 
     fn share(self, share: u32) -> Self {
@@ -96,10 +99,10 @@ pub fn all() -> Vec<Format> {
     let evaluated = "e.toml dataset.toml 0000/1.png 0000/2.png test/depth/0000/1.npz test/cameras/0000.json";
     let tensors = "out.safetensors";
     vec![
-        reconstruct("pictures", s::png_and_webp, "a.png b.webp", "in/a.png in/b.webp").share(56),
-        reconstruct("pictures-deep", s::deep_and_gif, "a.png b.gif", "in/a.png in/b.gif --as-is").share(56),
-        reconstruct("pictures-plain", s::tiff_and_bmp, "a.tiff b.bmp", "in/a.tiff in/b.bmp").share(56),
-        reconstruct("pictures-and-masks", s::jpegs_and_masks, "a.jpg b.jpg m.png m.jpg", masked).share(84),
+        reconstruct("pictures", s::png_and_webp, "a.png b.webp", "in/a.png in/b.webp").share(28),
+        reconstruct("pictures-deep", s::deep_and_gif, "a.png b.gif", "in/a.png in/b.gif --as-is").share(28),
+        reconstruct("pictures-plain", s::tiff_and_bmp, "a.tiff b.bmp", "in/a.tiff in/b.bmp").share(28),
+        reconstruct("pictures-and-masks", s::jpegs_and_masks, "a.jpg b.jpg m.png m.jpg", masked).share(42),
         // The first bytes of a picture say what it is, not its name.
         reconstruct("picture-heic", s::heic_and_masks, "a.jpg", masked),
         reconstruct(
@@ -108,9 +111,14 @@ pub fn all() -> Vec<Format> {
             "w.safetensors c.toml",
             "in/a.png in/b.webp --as-is --config in/c.toml",
         )
-        .share(56),
-        format("weights-export", s::weights, "w.safetensors", "export-weights in/w.safetensors -o out.safetensors")
-            .writes(tensors, s::tensors),
+        .share(28),
+        format(
+            "weights-export",
+            s::weights,
+            "w.safetensors",
+            "export-weights in/w.safetensors -o out.safetensors",
+        )
+        .writes(tensors, s::tensors),
         format(
             "weights-import",
             s::weights,
@@ -118,7 +126,7 @@ pub fn all() -> Vec<Format> {
             "import-weights in/w.safetensors --config in/c.toml -o out.safetensors",
         )
         .writes(tensors, s::weight_file)
-        .share(56),
+        .share(28),
         format(
             "checkpoint",
             s::checkpoints,
@@ -132,24 +140,28 @@ pub fn all() -> Vec<Format> {
         render("gaussians-glb", |folder| s::gaussians(folder, "h.glb"), "h.glb"),
         render("spz", |folder| s::gaussians(folder, "h.spz"), "h.spz"),
         // With spherical harmonics, from another implementation.
-        format("spz-harmonics", s::spz_harmonics, "h.spz", "convert in/h.spz out.ply").writes("out.ply", s::scene),
+        format("spz-harmonics", s::spz_harmonics, "h.spz", "convert in/h.spz out.ply")
+            .writes("out.ply", s::scene),
         // A mesh takes seconds, hence few cases.
         format("gaussians-mesh", s::column, "h.ply", "mesh in/h.ply --faces 500 --device cpu -o out.ply")
             .writes("out.ply", s::mesh)
-            .share(2),
+            .share(1),
         format(
             "cameras",
             s::cameras,
             "cameras.json",
             "render in/h.ply --cameras in/cameras.json --device cpu -o out",
-        ),
-        prepare("obj", s::obj_and_textures, ".obj .mtl .png .tiff", "scan in/a.obj").share(96),
+        )
+        .checked(s::rendered_by_cameras),
+        prepare("obj", s::obj_and_textures, ".obj .mtl .png .tiff", "scan in/a.obj").share(48),
         prepare("mesh-ply", |folder| s::ply(folder, "binary_little_endian"), ".ply", "scan in/a.ply"),
         prepare("mesh-ply-big-endian", |folder| s::ply(folder, "binary_big_endian"), ".ply", "scan in/a.ply"),
         prepare("mesh-ply-ascii", |folder| s::ply(folder, "ascii"), ".ply", "scan in/a.ply"),
-        prepare("glb", s::glb, "a.glb", "scan in/a.glb").share(96),
+        prepare("glb", s::glb, "a.glb", "scan in/a.glb").share(48),
         prepare("avatars", s::avatars, "b_suit.glb", "avatars in --subjects 1"),
-        Format { is_partial: true, ..prepare("smplx", s::smplx, ".pkl .json", "scan in --smplx in/smplx") }.share(84),
+        // The people whose files are sound are made.
+        Format { kept: &["out"], ..prepare("smplx", s::smplx, ".pkl .json", "scan in --smplx in/smplx") }
+            .share(42),
         prepare("config-data", s::data_config, "c.toml", "scan in/a.obj --config in/c.toml"),
         prepare(
             "makehuman",
@@ -157,21 +169,43 @@ pub fn all() -> Vec<Format> {
             "base.obj .mhskel .mhw .target .mhclo worn.obj .bvh",
             "makehuman in --subjects 1 --seed 2",
         ),
-        format("data-set", s::exact_set, "dataset.toml .png .npz .json", "prepare check in/set").share(56),
-        format("data-set-authors", s::authors_set, "dataset.toml .jpg .png .npy", "prepare check in/set_16_2")
-            .share(56),
-        format("data-set-packed", s::packed_set, "dataset.toml archives.csv .tar", "prepare check in/packed").share(56),
+        format("data-set", s::exact_set, "dataset.toml .png .npz .json", "prepare check in/set").share(28),
+        format(
+            "data-set-authors",
+            s::authors_set,
+            "dataset.toml .jpg .png .npy",
+            "prepare check in/set_16_2",
+        )
+        .share(28),
+        format("data-set-packed", s::packed_set, "dataset.toml archives.csv .tar", "prepare check in/packed")
+            .share(28),
         rehearsal("train-config", "train-stage1"),
         rehearsal("train-config-stage2", &format!("train-stage2 {trained}")),
-        report("evaluation", evaluated, &format!("evaluate --config in/e.toml {trained} --device cpu")).share(32),
-        report("evaluation-mesh", "0000.obj", "evaluate --config in/e.toml --mesh-dir in/scans --align similarity"),
-        report("bench-config", "b.toml", &format!("bench --config in/b.toml --quick {trained} --device cpu")),
+        report(
+            "evaluation",
+            evaluated,
+            &format!("evaluate --config in/e.toml {trained} --device cpu"),
+            |folder| s::report(folder, "protocols"),
+        )
+        .share(16),
+        report(
+            "evaluation-mesh",
+            "0000.obj",
+            "evaluate --config in/e.toml --mesh-dir in/scans --align similarity",
+            |folder| s::report(folder, "geometry_cm"),
+        ),
+        report(
+            "bench-config",
+            "b.toml",
+            &format!("bench --config in/b.toml --quick {trained} --device cpu"),
+            |folder| s::report(folder, "settings"),
+        ),
         format(
             "compare",
             s::compared,
             "a.png b.tiff m.png",
             "compare in/a.png in/b.tiff --mask in/m.png --window mask --json",
         )
-        .share(16),
+        .share(8),
     ]
 }

@@ -50,11 +50,10 @@ fn damaged_files_are_read_whole_or_refused() {
                 break;
             }
             let sample = sample.get_or_init(|| Sample::make(format, &root.path().join(format.name)));
-            if let Err(failure) = several(format, sample, first + round as u64, &root) {
+            if let Err(failure) = several(format, sample, first + round as u64, &root, &cases) {
                 println!("{failure}");
                 failures.lock().expect("no panic elsewhere").push(failure);
             }
-            cases.fetch_add(format.share as usize, Ordering::Relaxed);
         }
     };
     let cores = std::thread::available_parallelism().map_or(2, usize::from);
@@ -65,7 +64,13 @@ fn damaged_files_are_read_whole_or_refused() {
 }
 
 /// Runs as many cases as the format's share is. A failing case is made smaller and its files are kept.
-fn several(format: &Format, sample: &Sample, seed: u64, root: &TempDir) -> Result<(), String> {
+fn several(
+    format: &Format,
+    sample: &Sample,
+    seed: u64,
+    root: &TempDir,
+    cases: &AtomicUsize,
+) -> Result<(), String> {
     let config = Config {
         cases: format.share,
         failure_persistence: None,
@@ -79,6 +84,7 @@ fn several(format: &Format, sample: &Sample, seed: u64, root: &TempDir) -> Resul
     bytes[8..8 + name.len()].copy_from_slice(name);
     let random = TestRng::from_seed(RngAlgorithm::ChaCha, &bytes);
     let result = TestRunner::new_with_rng(config, random).run(&case::cases(), |case| {
+        cases.fetch_add(1, Ordering::Relaxed);
         let place = tempfile::tempdir_in(root).expect("a temporary folder");
         let problems = sample.run(format, Some(&case), place.path()).problems;
         if problems.is_empty() { Ok(()) } else { Err(TestCaseError::fail(problems.join("; "))) }
@@ -86,10 +92,12 @@ fn several(format: &Format, sample: &Sample, seed: u64, root: &TempDir) -> Resul
     let Err(TestError::Fail(reason, case)) = result else {
         return result.map_err(|e| e.to_string());
     };
-    let place = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("fuzz-{}-{seed}", format.name));
+    let place =
+        std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("fuzz-{}-{seed}", format.name));
     // Of a run before.
     let _ = std::fs::remove_dir_all(&place);
     sample.run(format, Some(&case), &place);
     let command = format!("cargo xtask fuzz --only {} --from {seed}", format.name);
-    Err(format!("{}: {reason}\n  {command}\n  {case:?}\n  files: {}", format.name, place.display()))
+    let file = sample.target(format, &case).display();
+    Err(format!("{}: {reason}\n  {command}\n  {file}: {case:?}\n  files: {}", format.name, place.display()))
 }

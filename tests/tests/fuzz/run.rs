@@ -162,8 +162,10 @@ fn about_words(printed: &[u8]) -> Vec<String> {
 
 fn about_files(format: &Format, is_done: bool, before: &Tree, after: &Tree) -> Vec<String> {
     // The folder of inputs may have another name that begins the same.
-    let is_input = |path: &Path| path.to_string_lossy().starts_with(&format!("{INPUTS}/"))
-        || path.to_string_lossy().starts_with(&format!("{INPUTS} "));
+    let is_input = |path: &Path| {
+        path.to_string_lossy().starts_with(&format!("{INPUTS}/"))
+            || path.to_string_lossy().starts_with(&format!("{INPUTS} "))
+    };
     let name = |path: &Path| path.display().to_string().escape_debug().to_string();
     let mut problems = Vec::new();
     for (path, content) in before {
@@ -173,7 +175,7 @@ fn about_files(format: &Format, is_done: bool, before: &Tree, after: &Tree) -> V
         }
     }
     for (path, content) in after.iter().filter(|(path, _)| !before.contains_key(*path)) {
-        let is_left = format.kept.iter().any(|kept| path == Path::new(kept));
+        let is_left = format.kept.iter().any(|kept| path.starts_with(kept));
         if UNFINISHED.iter().any(|part| path.to_string_lossy().contains(part)) {
             problems.push(format!("left {} unfinished", name(path)));
         } else if is_input(path) {

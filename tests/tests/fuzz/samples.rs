@@ -11,7 +11,7 @@ use image::{DynamicImage, GrayImage, ImageFormat, Luma, Rgb, RgbImage, Rgba, Rgb
 use safetensors::SafeTensors;
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::{self, Folder, Layout, Split};
-use snapsnap_data::prepare::{DataConfig, Subject, ViewsConfig};
+use snapsnap_data::prepare::{DataConfig, ViewsConfig};
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
 use snapsnap_mesh::{export, import};
 use snapsnap_net::config::Config;
@@ -23,8 +23,8 @@ use snapsnap_tests::{TRAINING, data};
 
 /// Side of a photograph: the smallest that is taken.
 const SIDE: u32 = 64;
-/// The smallest networks that make sense.
-const NETWORKS: &str = include_str!("../../../crates/train/src/stability/small.toml");
+/// A training of the smallest networks that make sense.
+const SMALL: &str = include_str!("../../../crates/train/src/stability/small.toml");
 /// What an evaluation must not do here: it would take seconds.
 const EVALUATION: &str = r#"
 [data]
@@ -75,7 +75,6 @@ only = ["0000"]
 inputs = [0, 2]
 [settings.tuned]
 knob = "Gaussians"
-tune = "colors"
 set = ["network.conf_threshold=0.4"]
 preset = "gsplat"
 antialiased = true
@@ -135,7 +134,9 @@ pub fn jpegs_and_masks(folder: &Path) {
     let length = (exif.len() as u16 + 2).to_be_bytes();
     put(folder, "a.jpg", [&jpeg[..2], &[0xff, 0xe1], &length, exif, &jpeg[2..]].concat());
     put(folder, "b.jpg", include_bytes!("../../../crates/mesh/tests/progressive.jpg"));
-    let mask = GrayImage::from_fn(SIDE, SIDE, |x, y| Luma([image::GenericImageView::get_pixel(&picture(), x, y).0[3]]));
+    let mask = GrayImage::from_fn(SIDE, SIDE, |x, y| {
+        Luma([image::GenericImageView::get_pixel(&picture(), x, y).0[3]])
+    });
     save(folder, "m.png", &mask.clone().into());
     save(folder, "m.jpg", &mask.into());
     weights(folder);
@@ -151,14 +152,19 @@ pub fn heic_and_masks(folder: &Path) {
 pub fn compared(folder: &Path) {
     save(folder, "a.png", &picture());
     save(folder, "b.tiff", &picture().into_rgb32f().into());
-    save(folder, "m.png", &GrayImage::from_fn(SIDE, SIDE, |x, _| Luma([if x < 40 { 255 } else { 0 }])).into());
+    save(
+        folder,
+        "m.png",
+        &GrayImage::from_fn(SIDE, SIDE, |x, _| Luma([if x < 40 { 255 } else { 0 }])).into(),
+    );
 }
 
 // Weights and configs.
 
 pub fn weights(folder: &Path) {
-    put(folder, "c.toml", NETWORKS);
-    let config = Config::from_toml(NETWORKS, "the smallest networks", &[]).expect("a sound config");
+    let (networks, _) = SMALL.split_once("[samples]").expect("sections of networks before the others");
+    put(folder, "c.toml", networks);
+    let config = Config::from_toml(networks, "the smallest networks", &[]).expect("a sound config");
     init(&config, 1, &folder.join("w.safetensors"), &|_, _| ()).expect("written");
 }
 
@@ -173,7 +179,11 @@ pub fn checkpoints(folder: &Path) {
 pub fn training(folder: &Path) {
     four_views(&folder.join("set"), &[Split::Train]);
     weights(folder);
-    put(folder, "t.toml", format!("{TRAINING}[data]\nfolders = [\"in/set\"]\n[samples.augment]\nexposure = 0.1\n"));
+    put(
+        folder,
+        "t.toml",
+        format!("{TRAINING}[data]\nfolders = [\"in/set\"]\n[samples.augment]\nexposure = 0.1\n"),
+    );
 }
 
 /// A test person with a scan and a training person, with four views each; weights, and both configs.
@@ -219,7 +229,8 @@ pub fn spz_harmonics(folder: &Path) {
 
 pub fn cameras(folder: &Path) {
     gaussians(folder, "h.ply");
-    snapsnap_splat::cameras::write(&Camera::orbit(2, 24, 16), &folder.join("cameras.json")).expect("written");
+    snapsnap_splat::camera_file::write(&Camera::orbit(2, 24, 16), &folder.join("cameras.json"))
+        .expect("written");
 }
 
 /// Gaussians on an upright ellipsoid of 2 by 0.24 metres, whose mesh takes a third of the time of a ball's.
@@ -272,11 +283,15 @@ pub fn obj_and_textures(folder: &Path) {
     obj(folder, "a.obj");
     let texture = image::open(folder.join("a_0.png")).expect("just written");
     save(folder, "a.tiff", &texture);
-    put(folder, "a.mtl", "newmtl m0\nKd 1 1 1\nmap_Kd a_0.png\nnewmtl m1\nKd 0.2 0.4 0.6\nmap_Kd -s 1 1 1 a.tiff\n");
+    put(
+        folder,
+        "a.mtl",
+        "newmtl m0\nKd 1 1 1\nmap_Kd a_0.png\nnewmtl m1\nKd 0.2 0.4 0.6\nmap_Kd -s 1 1 1 a.tiff\n",
+    );
 }
 
 pub fn glb(folder: &Path) {
-    export::write(&block(), glam::DVec3::ZERO, &folder.join("a.glb")).expect("written");
+    export::write(&block(), &folder.join("a.glb")).expect("written");
 }
 
 /// Colours, texture coordinates, polygons and an element that is skipped.
@@ -332,7 +347,10 @@ pub fn smplx(folder: &Path) {
         ("1.pkl", include_bytes!("../../../crates/data/tests/smplx/protocol2.pkl")),
         ("2.pkl", include_bytes!("../../../crates/data/tests/smplx/protocol4.pkl")),
         ("3.pkl", include_bytes!("../../../crates/data/tests/smplx/big_endian.pkl")),
-        ("4.json", br#"{"betas": [[0.1, 0.2]], "global_orient": [[0.1, 1.5707963267948966, 0]], "scale": 1.0}"#),
+        (
+            "4.json",
+            br#"{"betas": [[0.1, 0.2]], "global_orient": [[0.1, 1.5707963267948966, 0]], "scale": 1.0}"#,
+        ),
     ];
     for (name, content) in parameters {
         obj(folder, &format!("{}.obj", &name[..1]));
@@ -356,11 +374,8 @@ pub fn makehuman(folder: &Path) {
 
 fn set(root: &Path, splits: &[Split], views: ViewsConfig) {
     let config = DataConfig { views: ViewsConfig { samples_per_axis: 1, ..views }, ..DataConfig::default() };
-    let folder = Folder::create(root, config.description("for tests")).expect("created");
-    for split in splits {
-        config.add(&folder, &Subject::plain(*split, "0000"), &block()).expect("written");
-    }
-    folder.tidy();
+    let people = splits.iter().map(|split| (*split, "0000".to_owned(), block()));
+    config.make(root, "for tests", people).expect("written").tidy();
 }
 
 /// One subject of four views in each split.
@@ -406,12 +421,24 @@ pub fn mesh(folder: &Path) -> Result<(), String> {
     mesh.check().map_err(|e| e.to_string())
 }
 
-/// Whether `render` wrote two pictures of the cameras' size.
+/// Whether `render` wrote pictures of the sizes of its own two cameras.
 pub fn rendered(folder: &Path) -> Result<(), String> {
-    for view in 0..2 {
+    pictures_of(folder, &folder.join("out/cameras.json"))
+}
+
+/// Whether `render` wrote pictures of the sizes of the given cameras, whatever the folder of inputs is called.
+pub fn rendered_by_cameras(folder: &Path) -> Result<(), String> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let given = entries.map(|entry| entry.path().join("cameras.json")).find(|path| path.is_file());
+    pictures_of(folder, &given.unwrap_or_default())
+}
+
+fn pictures_of(folder: &Path, cameras: &Path) -> Result<(), String> {
+    let views = snapsnap_splat::camera_file::read(cameras).map_err(|e| e.to_string())?;
+    for (view, camera) in views.iter().enumerate() {
         let picture = image::open(folder.join(format!("out/{view:03}.png")));
         let picture = picture.map_err(|e| format!("picture {view}: {e}"))?;
-        if (picture.width(), picture.height()) != (16, 24) {
+        if (picture.width(), picture.height()) != (camera.width, camera.height) {
             return Err(format!("picture {view} has another size than its camera"));
         }
     }
@@ -447,11 +474,11 @@ pub fn data_set(folder: &Path) -> Result<(), String> {
     }
 }
 
-/// Whether there is a report of a command.
-pub fn report(folder: &Path) -> Result<(), String> {
+/// Whether there is a report of a command, with this key.
+pub fn report(folder: &Path, key: &str) -> Result<(), String> {
     let text = fs::read_to_string(folder.join("out/report.json")).map_err(|e| format!("report.json: {e}"))?;
     let report: serde_json::Value = serde_json::from_str(&text).map_err(|e| format!("report.json: {e}"))?;
-    match ["command", "left_out"].iter().find(|key| report[**key].is_null()) {
+    match ["command", "left_out", key].iter().find(|key| report[**key].is_null()) {
         Some(key) => Err(format!("report.json has no `{key}`")),
         None => Ok(()),
     }

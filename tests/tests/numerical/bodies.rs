@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::Config;
-use snapsnap_net::network::{Grid, Input, PointMap, PointPredictor, View};
+use snapsnap_net::network::{Input, PointMap, PointPredictor, View};
 use snapsnap_net::steps::Step;
 use snapsnap_net::weights::random_predictor;
 use snapsnap_net::{Reconstruction, Reconstructor, Window};
@@ -40,7 +40,7 @@ fn maps(net: &PointPredictor, input: Input) -> Vec<(View, Vec<f32>)> {
 
 fn whole(config: &Config, images: Tensor<4>) -> Input {
     let [_, _, h, w] = images.dims();
-    Input { images, grid: Grid([h / config.network.patch, w / config.network.patch]) }
+    Input { images, grid: [h / config.network.patch, w / config.network.patch] }
 }
 
 #[test]

@@ -6,7 +6,6 @@ mod networks;
 mod pipeline;
 mod properties;
 mod splat_fit;
-mod splat_fixtures;
 mod splat_invariants;
 mod splat_oracle;
 mod steps;

@@ -5,30 +5,20 @@
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
-use snapsnap_net::config::{ConfMode, Config, HeadKind};
-use snapsnap_net::network::{PointPredictor, View, activate};
+use snapsnap_base::config::Schema;
+use snapsnap_net::config::Config;
+use snapsnap_net::network::{Decoded, Encoded, Input, PointPredictor, View, activate};
 use snapsnap_net::regressor::{Attributes, Statistics};
 use snapsnap_net::weights::{Float, ImportOptions, SideHeads, WeightFile, import};
-use snapsnap_tests::{Numbers, assert_close, device, fixture};
+use snapsnap_tests::{Numbers, assert_close, device, fixture, toml_config};
 
 const TOKENS: f64 = 1e-5;
 const POINTS: f64 = 1e-4;
 
 /// The config of a fixture from its `config.json`. Heads without weights are drawn at random and not compared.
 fn config(folder: &Path) -> Config {
-    let text = std::fs::read_to_string(folder.join("config.json")).expect("config.json");
-    let json: serde_json::Value = serde_json::from_str(&text).expect("JSON");
-    let number = |key: &str| json[key].as_u64().unwrap_or_else(|| panic!("{key}")) as usize;
-    let four = |key: &str| std::array::from_fn(|i| json[key][i].as_u64().expect("a number") as usize);
-    let mut config = Config::default();
-    let n = &mut config.network;
-    (n.enc_dim, n.enc_depth, n.enc_heads) = (number("enc_dim"), number("enc_depth"), number("enc_heads"));
-    (n.dec_dim, n.dec_depth, n.dec_heads) = (number("dec_dim"), number("dec_depth"), number("dec_heads"));
-    (n.layer_dims, n.hooks) = (four("layer_dims"), four("hooks"));
-    (n.feature_dim, n.last_dim) = (number("feature_dim"), number("last_dim"));
-    n.head = if json["head"] == "dpt" { HeadKind::Dpt } else { HeadKind::Linear };
-    n.conf_mode = if json["conf_mode"][0] == "exp" { ConfMode::Exp } else { ConfMode::Sigmoid };
-    config
+    let text = toml_config(&folder.join("config.json"));
+    Config::from_toml(&text, "the fixture's config", &[]).expect("a config")
 }
 
 fn predictor(folder: &Path, config: &Config, device: &Device) -> PointPredictor {
@@ -51,9 +41,11 @@ fn network(name: &str, heads: usize) {
     let image = |i: usize| io.tensor::<4>(&format!("image{i}"), &device);
     let (front, back) = (image(1), image(2));
     let [b, _, h, w] = front.dims();
-    let grid = net.transformer().grid([h, w]);
-    let tokens = net.transformer().encode(Tensor::cat(vec![front, back], 0), &grid);
-    let halves = [tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b)];
+    let patch = config.network.patch;
+    let encoded =
+        net.encode(Input { images: Tensor::cat(vec![front, back], 0), grid: [h / patch, w / patch] });
+    let Encoded::Tokens(tokens, _) = &encoded else { panic!("{name} is no transformer") };
+    let halves = [tokens.clone().narrow(0, 0, b), tokens.clone().narrow(0, b, b)];
     for (i, half) in halves.iter().enumerate() {
         assert_close(
             &format!("{name} enc{}", i + 1),
@@ -62,8 +54,8 @@ fn network(name: &str, heads: usize) {
             TOKENS,
         );
     }
-    let [front, back] = halves;
-    let maps = net.transformer().decode(front, back, &grid);
+    let decoded = net.decode(encoded);
+    let Decoded::Tokens(maps, _) = &decoded else { panic!("{name} is no transformer") };
     for (side, maps) in maps.iter().enumerate() {
         for (layer, tokens) in maps.iter().enumerate().skip(1) {
             let key = format!("dec{}.{layer}", side + 1);
@@ -71,12 +63,12 @@ fn network(name: &str, heads: usize) {
         }
     }
     let mut compared = 0;
-    for &view in net.views() {
+    for (&view, raw) in net.views().iter().zip(net.raw(&decoded)) {
         let k = view as usize + 1;
         if !io.has(&format!("points.{k}")) {
             continue;
         }
-        let map = activate(net.transformer().raw_points(view, &maps, &grid), &config.network);
+        let map = activate(raw, &config.network);
         let what = format!("{name} {}", view.name());
         assert_close(&format!("{what} points"), map.points, &io.f32(&format!("points.{k}")), POINTS);
         assert_close(&format!("{what} conf"), map.conf, &io.f32(&format!("conf.{k}")), POINTS);

@@ -1,10 +1,10 @@
-//! The splatting operation against the dense f64 oracle, and the oracle against itself and the fixtures.
+//! The splatting operation against the dense f64 oracle and the fixtures of `tests/data/splat`, and the oracle against
+//! itself and the fixtures.
 
-use burn::tensor::{Tensor, TensorData};
 use snapsnap_splat::reference::{self, Cutoff, Scene};
-use snapsnap_splat::{Camera, RenderOptions, cameras, sh};
-use snapsnap_tests::scenes::{HostScene, Random, forward_camera, random_scene, random_upstream};
-use snapsnap_tests::{Numbers, device, device_name, fixture, is_on_gpu, values};
+use snapsnap_splat::{Camera, RenderOptions, camera_file};
+use snapsnap_tests::scenes::{HostScene, forward_camera, random_scene, random_upstream};
+use snapsnap_tests::{Numbers, device, device_name, fixture};
 
 use crate::distance;
 
@@ -53,7 +53,7 @@ const FIXTURES: [&str; 8] = [
 /// A fixture: numbers, scene, cameras, options.
 fn load(name: &str) -> (Numbers, HostScene, Vec<Camera>, RenderOptions) {
     let numbers = Numbers::read(&fixture(&format!("splat/{name}.safetensors")));
-    let cameras = cameras::read(&fixture(&format!("splat/{name}.cameras.json"))).expect("cameras");
+    let cameras = camera_file::read(&fixture(&format!("splat/{name}.cameras.json"))).expect("cameras");
     let columns = |name: &str| numbers.f32(name).1;
     let [m, q, s, o, c] = ["means", "rotations", "scales", "opacities", "colors"].map(columns);
     let gaussian = |i: usize| {
@@ -91,6 +91,13 @@ fn worst<'a>(
     worst
 }
 
+/// The fixture's weights of a camera's pixels `[H·W]`: red, green, blue, alpha, depth.
+fn upstream(numbers: &Numbers, camera: usize) -> Vec<[f32; 5]> {
+    let [color, alpha, depth] =
+        ["color", "alpha", "depth"].map(|part| numbers.f32(&format!("grad_{part}.{camera}")).1);
+    (0..alpha.len()).map(|p| [color[3 * p], color[3 * p + 1], color[3 * p + 2], alpha[p], depth[p]]).collect()
+}
+
 /// Compares pixels of all fixtures, and gradients of the small ones.
 #[test]
 fn the_oracle_agrees_with_the_fixtures() {
@@ -104,13 +111,8 @@ fn the_oracle_agrees_with_the_fixtures() {
             println!("{name}, camera {i}: pixels {worst:.1e}");
             // The constants ε, α_max and 1/255 are f32 here, f64 in the fixtures.
             assert!(worst < 1e-7, "{name}: {worst:e}");
-            let upstream = |part: &str| numbers.f32(&format!("grad_{part}.{i}")).1;
-            let [color, alpha, depth] = ["color", "alpha", "depth"].map(upstream);
-            let upstream: Vec<[f64; 5]> = (0..alpha.len())
-                .map(|p| {
-                    [color[3 * p], color[3 * p + 1], color[3 * p + 2], alpha[p], depth[p]].map(f64::from)
-                })
-                .collect();
+            let upstream: Vec<[f64; 5]> =
+                upstream(&numbers, i).into_iter().map(|weights| weights.map(f64::from)).collect();
             if ["antialiased", "near_plane", "far_from_origin"].contains(&name) {
                 let part = reference::gradient(&scene, camera, &options, Cutoff::Hard, &upstream);
                 match &mut gradient {
@@ -133,25 +135,37 @@ fn the_oracle_agrees_with_the_fixtures() {
     }
 }
 
-/// Compares the operation and the textbook formulas in f32 with every fixture.
+/// Compares pixels and gradients of the operation, and pixels of the textbook formulas in f32, with every fixture.
 #[test]
-fn the_operation_is_more_accurate_than_plain_f32() {
+fn the_operation_agrees_with_the_fixtures_better_than_plain_f32() {
     let Some(device) = device() else { return };
     for name in FIXTURES {
         let (numbers, host, cameras, options) = load(name);
         let (mut plain, mut ours) = (0.0_f64, 0.0_f64);
+        let mut gradient = vec![[0.0_f64; 14]; host.gaussians.len()];
+        let mut background = [0.0_f64; 3];
         for (i, camera) in cameras.iter().enumerate() {
             let banded: Vec<bool> = numbers.u8(&format!("banded.{i}")).1.iter().map(|b| *b != 0).collect();
             let scene = Scene { gaussians: host.gaussians.clone(), background: host.background };
             let pixels = reference::render(&scene, camera, &options, Cutoff::Hard);
             plain =
                 plain.max(worst(&numbers, i, pixels.iter().map(|p| p.channels().map(f64::from)), &banded));
-            let pass =
-                host.pass(std::slice::from_ref(camera), &options, &vec![0.0; 5 * pixels.len()], &device);
+            let upstream = upstream(&numbers, i).concat();
+            let pass = host.pass(std::slice::from_ref(camera), &options, &upstream, &device);
             let found = pass.image.chunks(5).map(|p| std::array::from_fn(|c| f64::from(p[c])));
             ours = ours.max(worst(&numbers, i, found, &banded));
+            let sums = gradient.iter_mut().flatten().chain(&mut background);
+            let parts = pass.gradient.iter().flatten().chain(&pass.background);
+            sums.zip(parts).for_each(|(sum, part)| *sum += f64::from(*part));
         }
         println!("{name}: pixels {plain:.1e} with the plain formulas, {ours:.1e} with ours");
+        assert!(ours <= 2e-5, "{name}: pixels differ by {ours:e}");
+        let inputs = PARTS.map(|(part, range)| (part, flat(&gradient, &range)));
+        for (part, found) in inputs.into_iter().chain([("background", background.to_vec())]) {
+            let (error, angle) = compare(&found, &numbers.f64(&format!("vjp.{part}")).1);
+            println!("{name}: {part} relative L2 {error:.1e}, 1 - cosine {angle:.1e}");
+            assert!(error <= 1e-3 && angle <= 1e-5, "{name}: gradient of {part}: {error:e}, {angle:e}");
+        }
         if name == "far_from_origin" {
             assert!(ours < 0.5 * plain, "{name}: {ours:e}, plain {plain:e}");
         }
@@ -330,106 +344,4 @@ fn beyond_the_border() {
         (7..10).for_each(|k| g[k] *= 4.0);
     }
     check("beyond the border", &host, &forward_camera(40, 33), &RenderOptions::inria());
-}
-
-/// Finite differences of the operation itself over every input, in a scene that meets no cut-off.
-#[test]
-fn finite_differences_of_the_operation() {
-    let Some(device) = device() else { return };
-    let camera = forward_camera(18, 14);
-    let options = RenderOptions::inria();
-    let mut host = random_scene(5, 51);
-    for g in &mut host.gaussians {
-        // Wide and half transparent: every pixel lies well inside.
-        (g[0], g[1]) = (0.2 * g[0], 0.2 * g[1]);
-        (7..10).for_each(|k| g[k] = 0.4 * g[2] + 0.3 * g[k]);
-        g[10] = 0.3 + 0.4 * g[10];
-    }
-    let upstream = random_upstream(18 * 14, 6);
-    let pass = host.pass(&[camera], &options, &upstream, &device);
-    let loss = |host: &HostScene| -> f64 {
-        let image = host.pass(&[camera], &options, &upstream, &device).image;
-        image.iter().zip(&upstream).map(|(i, u)| f64::from(*i) * f64::from(*u)).sum()
-    };
-    // The largest gradient of each kind of input: means, rotations, scales, opacities, colours.
-    let scale = |k: usize| {
-        let kind = [0..3, 3..7, 7..10, 10..11, 11..14].into_iter().find(|kind| kind.contains(&k));
-        let kind = kind.expect("fourteen numbers");
-        pass.gradient.iter().flat_map(|g| &g[kind.clone()]).fold(0.0_f32, |m, g| m.max(g.abs()))
-    };
-    for i in 0..host.gaussians.len() {
-        for k in 0..14 {
-            // Quaternions are of length 1, lengths of tenths.
-            let step = if (3..7).contains(&k) { 2e-2 } else { 4e-3 };
-            let at = |h: f32| {
-                let mut moved = host.clone();
-                moved.gaussians[i][k] += h;
-                loss(&moved)
-            };
-            let difference = (at(step) - at(-step)) / (2.0 * f64::from(step));
-            let analytic = f64::from(pass.gradient[i][k]);
-            // f32 rounds a sum of a thousand numbers by 1e-6, divided by the step. The rest is the third derivative.
-            let bound = 1e-3 * f64::from(scale(k)) + 0.02 * analytic.abs() + 1e-6 / f64::from(step);
-            assert!(
-                (analytic - difference).abs() < bound,
-                "Gaussian {i}, number {k}: {analytic} {difference}"
-            );
-        }
-    }
-}
-
-/// Spherical harmonics are an ordinary tensor function: their gradients agree with finite differences, in the
-/// coefficients and, through the direction of view, in the means.
-#[test]
-fn harmonics_are_differentiable() {
-    let Some(device) = device() else { return };
-    let tracking = device.autodiff();
-    let camera = Camera::orbit_at_yaw_degrees(30.0, 16);
-    let mut random = Random(61);
-    // Every shape is tuned anew on a GPU: one degree is enough there.
-    let all: &[usize] = if is_on_gpu() { &[16] } else { &[1, 4, 9, 16] };
-    for &k in all {
-        let n = 3;
-        let coefficients: Vec<f32> = (0..n * k * 3).map(|_| random.between(-0.1, 0.2)).collect();
-        let means: Vec<f32> = (0..n * 3).map(|_| random.between(-0.5, 1.0)).collect();
-        let weights: Vec<f32> = (0..n * 3).map(|_| random.between(-1.0, 1.0)).collect();
-        let colors = |coefficients: &[f32], means: &[f32]| {
-            let coefficients = TensorData::new(coefficients.to_vec(), [n, k, 3]);
-            let means = TensorData::new(means.to_vec(), [n, 3]);
-            let coefficients = Tensor::<3>::from_data(coefficients, &tracking).require_grad();
-            let means = Tensor::<2>::from_data(means, &tracking).require_grad();
-            let colors = sh::colors(&coefficients, &means, &camera).expect("shapes");
-            let weights = Tensor::<2>::from_data(TensorData::new(weights.clone(), [n, 3]), &tracking);
-            (coefficients, means, (colors * weights).sum())
-        };
-        let (c, m, loss) = colors(&coefficients, &means);
-        let grads = loss.backward();
-        let loss_at =
-            |coefficients: &[f32], means: &[f32]| values(colors(coefficients, means).2.reshape([1]))[0];
-        let step = 1e-2;
-        let check = |what: &str, analytic: f32, difference: f32| {
-            assert!(
-                (analytic - difference).abs() < 2e-3 + 0.01 * analytic.abs(),
-                "{k} {what}: {analytic} {difference}"
-            );
-        };
-        for (i, analytic) in values(c.grad(&grads).expect("tracked").reshape([-1])).into_iter().enumerate() {
-            let at = |h: f32| {
-                let mut moved = coefficients.clone();
-                moved[i] += h;
-                loss_at(&moved, &means)
-            };
-            check("coefficient", analytic, (at(step) - at(-step)) / (2.0 * step));
-        }
-        let gradient = m.grad(&grads).map(|g| values(g.reshape([-1]))).unwrap_or_default();
-        assert_eq!(gradient.is_empty(), k == 1, "a constant colour does not depend on the direction");
-        for (i, analytic) in gradient.into_iter().enumerate() {
-            let at = |h: f32| {
-                let mut moved = means.clone();
-                moved[i] += h;
-                loss_at(&coefficients, &moved)
-            };
-            check("mean", analytic, (at(step) - at(-step)) / (2.0 * step));
-        }
-    }
 }

@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 
-use snapsnap_tests::{TRAINING, snapsnap, succeed};
+use snapsnap_tests::{TRAINING, snapsnap, succeed, synthetic_people};
 
 /// A data set of three training people and one held-out person, made once.
 fn people() -> &'static Path {
@@ -22,11 +22,8 @@ fn people() -> &'static Path {
     PEOPLE.get_or_init(|| {
         let folder =
             PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("people-{}", std::process::id()));
-        for (split, count) in [("train", "3"), ("val", "1")] {
-            let mut command = snapsnap();
-            command.args(["prepare", "synth", "--seed", "5", "--subjects", count, "--split", split]);
-            command.args(["--set", "views.count=4", "--set", "views.resolution=64", "-o"]).arg(&folder);
-            succeed(&mut command);
+        for (split, count) in [("train", 3), ("val", 1)] {
+            succeed(&mut synthetic_people(&folder, split, count, 4));
         }
         folder
     })
@@ -64,16 +61,4 @@ fn logged(run: &Path, name: &str) -> Vec<(u64, f64)> {
     let lines = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("a line"));
     let value = |line: serde_json::Value| Some((line["step"].as_u64()?, line["values"][name].as_f64()?));
     lines.filter_map(value).collect()
-}
-
-fn copy_folder(from: &Path, to: &Path) {
-    fs::create_dir_all(to).expect("makes");
-    for entry in fs::read_dir(from).expect("lists").map(|entry| entry.expect("entry").path()) {
-        let target = to.join(entry.file_name().expect("named"));
-        if entry.is_dir() {
-            copy_folder(&entry, &target);
-        } else {
-            fs::copy(&entry, &target).expect("copies");
-        }
-    }
 }

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 use std::{fs, thread};
 
 use snapsnap_net::weights::Source;
-use snapsnap_tests::{fill_weights, refused, snapsnap, succeed};
+use snapsnap_tests::{copy_folder, files, fill_weights, refused, succeed, synthetic_people};
 
-use super::{copy_folder, people, place, results, train, train_on};
+use super::{people, place, results, train, train_on};
 
 #[test]
 fn wrong_settings_weights_and_folders_are_refused_by_name() {
@@ -22,13 +22,14 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     };
     wrong(&["--set", "training.batches=3"], &["unknown field", "batches"]);
     wrong(&["--set", "training.steps=0"], &["training.steps", "must be"]);
-    wrong(&["--set", "training.clip=nan"], &["training.clip"]);
+    wrong(&["--set", "training.ema_decay=nan"], &["training.ema_decay"]);
+    wrong(&["--set", "training.precision=f16"], &["training.precision", "bf16"]);
     wrong(&["--set", "training.batch=0"], &["training.batch", "must be"]);
     wrong(&["--set", "optimizer.beta2=1.0"], &["optimizer.beta2"]);
-    wrong(&["--set", "schedule.end=2"], &["schedule.end"]);
+    wrong(&["--set", "samples.placed_share=2"], &["samples.placed_share"]);
     wrong(&["--set", "network.resolution=128", "--set", "network.net_resolution=128"], &["64", "128"]);
     wrong(&["--set", "network.conf_mode=exp"], &["conf_mode", "sigmoid"]);
-    wrong(&["--set", "optimizer.epsilon=0"], &["optimizer.epsilon"]);
+    wrong(&["--set", "stage2.anisotropy_limit=0.5"], &["stage2.anisotropy_limit"]);
     wrong(&["--set", "schedule.warm_up=1000000"], &["schedule.warm_up", "training.steps"]);
     wrong(&["--set", "network.delta=1e30"], &["network.delta", "1000000"]);
     wrong(&["--minutes", "0"], &["--minutes", "more than 0"]);
@@ -50,11 +51,9 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     assert!(said.contains("stage 1"), "{said}");
     // Tensors of the same shapes that mean something else.
     let other = temporary.path().join("meaning");
-    for (key, named) in [
-        ("network.rope_base=50", "`network.rope_base`"),
-        ("network.mirror=true", "`network.mirror`"),
-        ("network.enc_heads=1", "`network.enc_heads`"),
-    ] {
+    for (key, named) in
+        [("network.mirror=true", "`network.mirror`"), ("network.enc_heads=1", "`network.enc_heads`")]
+    {
         for stage in [1, 2] {
             let mut command = train(stage, &config, &other);
             let said = refused(command.args(["--set", key, "--weights"]).arg(run.join("last.safetensors")));
@@ -63,12 +62,9 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     }
     assert!(!other.exists());
     assert!(results(&run) == before);
-    let said = refused(train(1, &config, &run.join("other")).args(["--set", "training.batch=4096"]).args([
-        "--set",
-        "network.resolution=4096",
-        "--set",
-        "network.net_resolution=4096",
-    ]));
+    let huge = ["training.batch", "network.resolution", "network.net_resolution"];
+    let huge = huge.map(|key| format!("--set={key}=4096"));
+    let said = refused(train(1, &config, &run.join("other")).args(huge));
     assert!(said.contains("GB of memory"), "{said}");
 }
 
@@ -79,17 +75,11 @@ fn a_new_run_replaces_no_file() {
     let run = temporary.path().join("run");
     succeed(train(1, &config, &run).arg("--set=training.steps=2"));
     fs::remove_dir_all(run.join("state")).expect("removes");
-    let all = || {
-        let mut files: Vec<_> =
-            fs::read_dir(&run).expect("lists").map(|e| e.expect("entry").path()).collect();
-        files.sort();
-        files.into_iter().map(|path| (fs::read(&path).unwrap_or_default(), path)).collect::<Vec<_>>()
-    };
-    let before = all();
+    let before = files(&run);
     for arguments in [&["--set=training.steps=2"][..], &["--resume"]] {
         let said = refused(train(1, &config, &run).args(arguments));
         assert!(said.contains("best.safetensors") && said.contains("would be replaced"), "{said}");
-        assert!(all() == before);
+        assert!(files(&run) == before);
     }
     for name in ["log.jsonl", "curves.svg", "config.toml", "previews/1.png"] {
         let own = temporary.path().join(name.replace('/', "-"));
@@ -212,10 +202,7 @@ fn the_best_validation_is_of_the_present_people() {
     let (temporary, config) = place();
     let [run, far] = ["run", "far"].map(|name| temporary.path().join(name));
     for split in ["train", "val"] {
-        let mut command = snapsnap();
-        command.args(["prepare", "synth", "--seed=5", "--subjects=1", "--split", split]);
-        command.args(["--set=views.count=4", "--set=views.resolution=64", "--set=views.distance=2", "-o"]);
-        succeed(command.arg(&far));
+        succeed(synthetic_people(&far, split, 1, 4).arg("--set=views.distance=2"));
     }
     let said = succeed(&mut train(1, &config, &run));
     let best = |said: &str| {

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use snapsnap_tests::{refused, snapsnap, succeed};
+use snapsnap_tests::{limited, refused, snapsnap, succeed};
 
 use super::{logged, people, place, results, train, train_on};
 
@@ -66,11 +66,8 @@ fn sessions_after_a_time_limit_or_an_interrupt_end_with_the_same_bytes() {
     fs::copy(one.join("last.safetensors"), &weights).expect("copies");
     let (whole, pieces) = (temporary.path().join("whole"), temporary.path().join("pieces"));
     succeed(train(2, &config, &whole).arg("--weights").arg(&weights));
-    let said = succeed(train(2, &config, &pieces).arg("--weights").arg(&weights).args([
-        "--minutes",
-        "0.001",
-        "--resume",
-    ]));
+    let mut command = train(2, &config, &pieces);
+    let said = succeed(command.args(["--minutes", "0.001", "--resume", "--weights"]).arg(&weights));
     assert!(said.contains("interrupted") && said.contains("--resume"), "{said}");
     // The run's folder contains its predictor, data paths and config.
     fs::remove_file(&weights).expect("removes");
@@ -129,10 +126,7 @@ fn a_full_disk_leaves_the_last_checkpoint_and_exit_code_2() {
     let run = temporary.path().join("run");
     succeed(train(1, &config, &run).args(["--set", "training.steps=8"]));
     let before = results(&run);
-    let command = train(1, &config, &run);
-    let mut shell = Command::new("sh");
-    shell.args(["-c", "trap '' XFSZ; ulimit -f 20; exec \"$@\"", "sh"]).arg(command.get_program());
-    let said = refused(shell.args(command.get_args()).arg("--resume"));
+    let said = refused(&mut limited(train(1, &config, &run).arg("--resume"), "-f 20"));
     assert!(said.contains("cannot write"), "{said}");
     assert!(results(&run) == before, "a file was changed");
     succeed(train(1, &config, &run).arg("--resume"));

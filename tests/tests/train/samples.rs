@@ -3,9 +3,9 @@
 use std::fs;
 use std::path::PathBuf;
 
-use snapsnap_tests::{refused, succeed};
+use snapsnap_tests::{copy_folder, refused, succeed};
 
-use super::{copy_folder, logged, people, place, results, train, train_on};
+use super::{logged, people, place, results, train, train_on};
 
 #[test]
 fn a_broken_sample_is_skipped_and_named_and_twenty_in_a_row_end_the_run() {

@@ -11,8 +11,8 @@ use snapsnap_eval::bench::{Measured, dominated, measure};
 use snapsnap_eval::evaluate::LeftOut;
 
 use super::evaluate::{check_data, opened};
-use super::outside_data;
 use crate::failure::Failure;
+use crate::output::outside_data;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, complete, header, nothing_left};
 use crate::{device, memory, perceptual, say};

@@ -1,7 +1,6 @@
 //! `snapsnap compare`.
 
 use std::collections::BTreeSet;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
@@ -14,14 +13,13 @@ use snapsnap_eval::score::Score;
 use snapsnap_eval::similarity::{check_sizes, ssim_of_loss};
 use snapsnap_mesh::picture::{self, MAX_BYTES, decode};
 
+use crate::batch::pictures;
 use crate::failure::{Failure, bail};
 use crate::report::print_left_out;
 use crate::{memory, perceptual, say};
 
 /// Bytes per pixel of two pictures: decoded, as planes, and the compared parts.
 const BYTES: u64 = 160;
-/// File extensions of pictures in folders.
-const ENDINGS: [&str; 7] = ["png", "jpg", "jpeg", "webp", "bmp", "tif", "tiff"];
 
 #[derive(Args)]
 pub struct Arguments {
@@ -138,16 +136,8 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
 
 /// Names of the pictures of a folder.
 fn pictures_in(folder: &Path) -> Result<BTreeSet<String>, Failure> {
-    let failed = |e| Failure::file(folder, format_args!("cannot read this folder: {e}"));
-    let mut names = BTreeSet::new();
-    for entry in fs::read_dir(folder).map_err(failed)? {
-        let path = entry.map_err(failed)?.path();
-        let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
-        if ENDINGS.contains(&ending.as_str()) && path.is_file() {
-            names.extend(path.file_name().map(|name| name.to_string_lossy().into_owned()));
-        }
-    }
-    Ok(names)
+    let name = |path: PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    Ok(pictures(folder)?.map(name).collect())
 }
 
 fn compare(

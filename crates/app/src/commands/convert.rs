@@ -6,9 +6,9 @@ use clap::Args;
 use serde::Serialize;
 use snapsnap_splat::scene::{Kind, Stored};
 
-use super::{check_kind, check_outputs};
-use crate::batch::{self, KindArgument, ShardArgument};
+use crate::batch::{self, KindArgument, ShardArgument, must_be_unused};
 use crate::failure::Failure;
+use crate::output::{check_kind, check_outputs};
 use crate::say;
 
 #[derive(Args)]
@@ -58,8 +58,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         axes.check(&file("x"))?;
         return batch::each(input, output, shard, file, |path, name| one(path, &file(name), axes));
     }
-    kind.must_be_unused(batch::ONE)?;
-    shard.must_be_unused(batch::ONE)?;
+    must_be_unused(&[("--kind", kind.kind.is_some()), ("--shard", shard.shard.is_some())], batch::ONE)?;
     one(input, output, axes)
 }
 

@@ -11,11 +11,11 @@ use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::similarity::psnr;
 use snapsnap_net::Reconstructor;
-use snapsnap_net::config::PrecisionChoice;
+use snapsnap_net::precision::Precision;
 use snapsnap_photo::{Cutting, Source, Told};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render, scene};
 
-use super::ConfigArguments;
+use crate::arguments::ConfigArguments;
 use crate::failure::Failure;
 use crate::pictures::{read_back, sheet, write_png};
 use crate::progress::Progress;
@@ -80,7 +80,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let told = Told { as_is: true, ..Told::default() };
     let side = config.network.resolution;
     let read = snapsnap_photo::read(&sources, Cutting::Given, side, told.placement(&config), None)?;
-    let precision = PrecisionChoice::Auto.of_weights(&config, &device);
+    let precision = Precision::of_weights(&config, &device);
     let networks = Reconstructor::load(&weights, &device)?.in_precision(precision);
     let made = snapsnap_photo::person(&read, &networks, &told, &|name| progress.stage(name));
     let world = made.map_err(|none| Failure::Input(none.to_string()))?.gaussians;

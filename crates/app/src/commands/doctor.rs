@@ -8,8 +8,8 @@ use serde_json::{Value, json};
 use snapsnap_eval::lpips::Lpips;
 use snapsnap_net::precision::cpu_has_bf16;
 
-use super::ConfigArguments;
-use crate::device::{self, Found};
+use crate::arguments::ConfigArguments;
+use crate::device::{self, Adapter};
 use crate::failure::Failure;
 use crate::{memory, perceptual, say, weights};
 
@@ -45,17 +45,17 @@ struct Missing {
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
-    let devices = device::found();
-    let (chosen, why) = chosen(&devices);
+    let graphics = device::adapters();
+    let devices: Vec<Adapter> = device::processors().into_iter().chain(graphics.iter().cloned()).collect();
+    let (chosen, why) = chosen(graphics);
     let weights = weights_found(arguments);
     let memory = memory::there();
-    let missing = missing(&devices, &weights, memory);
+    let missing = missing(graphics, &weights, memory);
     if arguments.json {
-        let device = |found: &Found| {
-            json!({
-                "name": found.name, "adapter": found.adapter, "backend": found.backend,
-                "software": found.software, "memory_bytes": found.memory, "chosen": found.name == chosen,
-            })
+        let device = |found: &Adapter| {
+            let mut value = json!(found);
+            value["chosen"] = json!(found.name == chosen);
+            value
         };
         let weight = |w: &Weights| {
             let (Ok(text) | Err(text)) = &w.state;
@@ -131,13 +131,11 @@ fn broken(weights: &[Weights]) -> Result<(), Failure> {
 }
 
 /// The name of the device that `--device auto` takes, and the reason.
-fn chosen(devices: &[Found]) -> (String, &'static str) {
-    match devices.iter().find(|found| found.card) {
-        Some(found) => (found.name.clone(), "the first hardware GPU found"),
-        None if devices.iter().any(|found| found.software) => {
-            ("cpu".into(), "no hardware GPU found, and software adapters are slower than the CPU")
-        }
-        None => ("cpu".into(), "no GPU found"),
+fn chosen(graphics: &[Adapter]) -> (&str, &'static str) {
+    match graphics.iter().find(|found| !found.software) {
+        Some(found) => (found.name.as_str(), "the first hardware GPU found"),
+        None if graphics.is_empty() => ("cpu", "no GPU found"),
+        None => ("cpu", "no hardware GPU found, and software adapters are slower than the CPU"),
     }
 }
 
@@ -164,10 +162,10 @@ fn weights_found(arguments: &Arguments) -> Vec<Weights> {
     found
 }
 
-fn missing(devices: &[Found], weights: &[Weights], memory: u64) -> Vec<Missing> {
+fn missing(graphics: &[Adapter], weights: &[Weights], memory: u64) -> Vec<Missing> {
     let mut missing = Vec::new();
     let mut add = |what: &str, mend| missing.push(Missing { what: what.into(), mend });
-    if !devices.iter().any(|found| found.card) {
+    if graphics.iter().all(|found| found.software) {
         let mend = if device::is_opengl() {
             "the card works with OpenGL only, which is not used: install its Vulkan driver (Debian, Ubuntu: apt-get install \
              libvulkan1 mesa-vulkan-drivers, or NVIDIA's own)"

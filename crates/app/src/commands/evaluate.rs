@@ -9,8 +9,8 @@ use burn::tensor::Device;
 use clap::Args;
 use serde_json::Value;
 use snapsnap_base::config::Schema;
-use snapsnap_data::sample::Handling;
-use snapsnap_eval::baselines::MeanPictures;
+use snapsnap_data::sample::PhotographChanges;
+use snapsnap_eval::evaluate::baselines::MeanPictures;
 use snapsnap_eval::evaluate::config::EvalConfig;
 use snapsnap_eval::evaluate::meshes::evaluate_meshes;
 use snapsnap_eval::evaluate::model::Model;
@@ -22,8 +22,9 @@ use snapsnap_eval::report::evaluation::{Cost, Evaluation};
 use snapsnap_eval::variant::Variant;
 use snapsnap_net::weights::WeightFile;
 
-use super::{ConfigArguments, one_of, outside_data};
+use crate::arguments::{ConfigArguments, one_of};
 use crate::failure::{Failure, bail};
+use crate::output::outside_data;
 use crate::pictures::write_png;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, complete, header, nothing_left};
@@ -214,7 +215,7 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
         config.metrics.align = align;
     }
     if let Some(grey) = arguments.inputs {
-        let photographs = Some(Handling { grey, ..config.photographs });
+        let photographs = Some(PhotographChanges { grey, ..config.photographs });
         config.ablations.insert("grey".into(), Variant { photographs, ..Variant::default() });
     }
     Ok(config)

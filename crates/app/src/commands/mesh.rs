@@ -9,9 +9,9 @@ use snapsnap_mesh::export::{self, Kind};
 use snapsnap_mesh::fuse::{Fused, Options, fuse};
 use snapsnap_splat::scene::{self, Loaded};
 
-use super::check_outputs;
-use crate::batch::{self, ShardArgument};
-use crate::failure::{Failure, bail};
+use crate::batch::{self, ShardArgument, must_be_unused};
+use crate::failure::Failure;
+use crate::output::check_outputs;
 use crate::progress::Progress;
 use crate::{device, memory, say};
 
@@ -48,7 +48,7 @@ pub struct Arguments {
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Print the closed and dropped parts, and the time.
+    /// Print the joined and dropped parts, and the time.
     #[arg(short, long)]
     verbose: bool,
 }
@@ -66,13 +66,9 @@ pub struct SurfaceArguments {
 }
 
 impl SurfaceArguments {
-    /// Refuses options that would have no effect; otherwise `None`.
-    pub fn must_be_unused<T>(&self, why: &str) -> Result<Option<T>, Failure> {
-        let given = [("--faces", self.faces.is_some()), ("--texture", self.texture.is_some())];
-        match given.iter().find(|(_, given)| *given) {
-            Some((name, _)) => Err(Failure::Input(format!("{name}: {why}"))),
-            None => Ok(None),
-        }
+    /// Refuses options that have no effect without a mesh.
+    pub fn must_be_unused(&self, why: &str) -> Result<(), Failure> {
+        must_be_unused(&[("--faces", self.faces.is_some()), ("--texture", self.texture.is_some())], why)
     }
 }
 
@@ -89,10 +85,7 @@ pub fn options(kind: Kind) -> Options {
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let Arguments { input, output, kind, shard, .. } = arguments;
     if !input.is_dir() {
-        shard.must_be_unused(batch::ONE)?;
-        if kind.is_some() {
-            bail!("--kind: {}", batch::ONE);
-        }
+        must_be_unused(&[("--kind", kind.is_some()), ("--shard", shard.shard.is_some())], batch::ONE)?;
         return one(arguments, &device::choose(&arguments.device)?);
     }
     let file = |name: &str| output.join(format!("{name}.{}", kind.as_deref().unwrap_or("glb")));
@@ -178,7 +171,7 @@ impl Target {
         let fused = fuse(scene, self.options, &|name| progress.stage(name));
         let fused = fused.map_err(|e| Failure::from(e).about(name))?;
         progress.stage("writing");
-        export::write(&fused.mesh, fused.offset, &self.path)?;
+        export::write(&fused.mesh, &self.path)?;
         drop(progress);
         self.warn(&fused, name);
         Ok(fused)
@@ -202,25 +195,10 @@ impl Target {
     }
 }
 
-/// A length in millimetres, or in metres if it is very small or large.
-fn length(metres: f32) -> String {
-    if (1e-4..1.0).contains(&metres) { format!("{:.1} mm", 1e3 * metres) } else { format!("{metres:.1e} m") }
-}
-
 /// A description of the fusion.
-pub fn describe(fused: &Fused) -> String {
+pub fn describe(Fused { mesh, joined, dropped, faces, .. }: &Fused) -> String {
     format!(
-        "surface from a field of {}: gaps between the shells closed: {}, hollows filled: {}, \
-         narrow tunnels closed: {}, handles left: {}, parts joined with the body: {}, flying pieces dropped: {}; \
-         {} triangles reduced to {}",
-        length(fused.cell),
-        fused.closed,
-        fused.filled,
-        fused.walls,
-        fused.handles,
-        fused.joined,
-        fused.dropped,
-        fused.faces,
-        fused.mesh.faces.len()
+        "parts joined with the body: {joined}, flying pieces dropped: {dropped}; {faces} triangles reduced to {}",
+        mesh.faces.len()
     )
 }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use snapsnap_base::config::{differences, keys};
 use snapsnap_base::{FileError, file};
 use snapsnap_mesh::picture;
@@ -16,17 +16,15 @@ use snapsnap_photo::{Photographs, Source, Told};
 use snapsnap_splat::scene::Stored;
 
 use super::convert::AxesArguments;
-use super::reconstruct::{Arguments, check_memory};
-use crate::batch::{Batch, files, stem, unpanicked};
+use super::reconstruct::Arguments;
+use crate::batch::{Batch, pictures, stem, unpanicked};
 use crate::failure::{Failure, bail};
+use crate::model::check_memory;
 use crate::progress::Progress;
 use crate::{output, say, weights};
 
 /// The config of all people in an output folder.
 const CONFIG: &str = "pairs.config.toml";
-/// Extensions of photographs.
-const PICTURES: [&str; 11] =
-    ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "gif", "heic", "heif", "hif"];
 /// Largest table and config in bytes.
 const LARGEST_TABLE: u64 = 256 << 20;
 const LARGEST_CONFIG: u64 = 1 << 20;
@@ -67,7 +65,7 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
     let opened = arguments.model.open()?;
     let config = opened.config.clone();
     let told = arguments.camera.told(&config, arguments.as_is)?;
-    arguments.surface.must_be_unused::<()>("--pairs makes no meshes: snapsnap mesh takes their folder")?;
+    arguments.surface.must_be_unused("--pairs makes no meshes: snapsnap mesh takes their folder")?;
     let device = arguments.model.device(&opened)?;
     let (networks, precision) = arguments.model.load(&opened, &device)?;
     let path = folder.join(CONFIG);
@@ -178,6 +176,17 @@ fn write_all(
     }
 }
 
+/// A row of a table. Each column may be missing, and each value empty.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Row {
+    name: Option<String>,
+    front: Option<PathBuf>,
+    back: Option<PathBuf>,
+    front_mask: Option<PathBuf>,
+    back_mask: Option<PathBuf>,
+}
+
 /// The people of a table with the columns `front` and `back`, and perhaps `name`, `front_mask` and `back_mask`. Paths
 /// are relative to the table's folder.
 fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
@@ -185,38 +194,27 @@ fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let text = file::read_text(path, LARGEST_TABLE).map_err(FileError::read(path))?;
     let mut table = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(text.as_bytes());
-    let columns: Vec<String> = table.headers().map_err(cannot)?.iter().map(str::to_owned).collect();
-    for (i, column) in columns.iter().enumerate() {
-        let is_known = ["name", "front", "back", "front_mask", "back_mask"].contains(&column.as_str());
-        if !is_known || columns[..i].contains(column) {
-            let message =
-                "the columns are front and back, and perhaps name, front_mask and back_mask, each once";
-            return Err(Failure::file(path, format_args!("column `{column}`: {message}")));
-        }
-    }
+    let columns = table.headers().map_err(cannot)?.clone();
     if let Some(missing) =
-        ["front", "back"].into_iter().find(|name| !columns.iter().any(|column| column == name))
+        ["front", "back"].iter().find(|name| !columns.iter().any(|column| column == **name))
     {
         return Err(Failure::file(path, format_args!("has no column `{missing}`")));
     }
     let mut jobs = Vec::new();
-    for row in table.records() {
-        let row = row.map_err(cannot)?;
-        let line = row.position().map_or(0, csv::Position::line);
-        let value = |name: &str| {
-            let place = columns.iter().position(|column| column == name)?;
-            row.get(place).filter(|value| !value.is_empty())
-        };
+    for record in table.records() {
+        let record = record.map_err(cannot)?;
+        let line = record.position().map_or(0, csv::Position::line);
         let wrong = |message: &str| Failure::file(path, format_args!("line {line}: {message}"));
-        if row.iter().any(|value| value.contains(char::is_control)) {
+        if record.iter().any(|value| value.contains(char::is_control)) {
             return Err(wrong("a value has a line break: is a quotation mark missing?"));
         }
-        let (Some(front), Some(back)) = (value("front"), value("back")) else {
+        let row: Row = record.deserialize(Some(&columns)).map_err(cannot)?;
+        let (Some(front), Some(back)) = (row.front, row.back) else {
             return Err(wrong("needs a front and a back"));
         };
-        let name = match value("name") {
-            Some(name) => name.to_owned(),
-            None => named_by(Path::new(front)).ok_or_else(|| wrong("needs a name"))?,
+        let name = match row.name {
+            Some(name) => name,
+            None => named_by(&front).ok_or_else(|| wrong("needs a name"))?,
         };
         let is_forbidden = |c: char| FORBIDDEN.contains(c);
         if name.len() > LONGEST
@@ -226,7 +224,7 @@ fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
         {
             return Err(wrong(&format!("`{name}` cannot be the name of a file")));
         }
-        let masks = ["front_mask", "back_mask"].map(|name| value(name).map(|mask| folder.join(mask)));
+        let masks = [row.front_mask, row.back_mask].map(|mask| mask.map(|mask| folder.join(mask)));
         jobs.push(Job { name, photographs: Ok([folder.join(front), folder.join(back)]), masks });
     }
     checked(path, jobs)
@@ -247,11 +245,7 @@ const ENDS: [&str; 4] = ["_front", "_back", "_front_mask", "_back_mask"];
 fn in_folder(folder: &Path) -> Result<Vec<Job>, Failure> {
     let mut found = BTreeMap::new();
     let mut others = 0;
-    for path in files(folder)? {
-        let extension = path.extension().and_then(|extension| extension.to_str()).map(str::to_lowercase);
-        if !extension.is_some_and(|extension| PICTURES.contains(&extension.as_str())) {
-            continue;
-        }
+    for path in pictures(folder)? {
         let stem = stem(&path)?;
         if !ENDS.iter().any(|end| stem.ends_with(end)) {
             others += 1;

@@ -10,27 +10,22 @@ use serde_json::{Value, json};
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_mesh::picture;
-use snapsnap_net::Reconstructor;
-use snapsnap_net::config::{Config, OPPOSITE};
-use snapsnap_net::precision::{Precision, PrecisionChoice, cpu_has_bf16};
-use snapsnap_net::weights::WeightFile;
-use snapsnap_net::weights::schema::Part;
+use snapsnap_net::config::Config;
+use snapsnap_net::precision::{Precision, cpu_has_bf16};
 use snapsnap_photo::{Cutting, Person, Photographs, Source, Told};
 use snapsnap_splat::scene::Stored;
 
 use super::convert::AxesArguments;
 use super::mesh::{self, SurfaceArguments, Target};
-use super::{ConfigArguments, check_kind, check_outputs, is_same_file, pairs};
-use crate::batch::{KindArgument, ShardArgument};
+use super::pairs;
+use crate::batch::{KindArgument, ShardArgument, must_be_unused};
+use crate::camera_options::CameraArguments;
 use crate::failure::{Failure, bail};
+use crate::model::{ModelArguments, check_memory};
+use crate::output::{check_kind, check_outputs, is_same_file};
 use crate::progress::Progress;
-use crate::told::CameraArguments;
 use crate::turntable::Turntable;
-use crate::{cutouts, device, dump, memory, output, say, weights};
-
-/// Bytes per pixel of a photograph while it is placed on its canvas: 4 of the decoded picture, 3 + 1 of its colours
-/// and mask, 4 of a plane of f32, 3 + 1 of the other photograph's colours and mask, and 2 to spare.
-const BYTES_PER_PIXEL: u64 = 18;
+use crate::{cutouts, device, dump, memory, output, say};
 
 /// The output of one person.
 const DEFAULT_OUTPUT: &str = "human.ply";
@@ -131,83 +126,6 @@ impl Arguments {
     }
 }
 
-/// The networks and what computes them.
-#[derive(Args)]
-pub struct ModelArguments {
-    /// Weight file, or a folder that contains `weights.safetensors` [default: the program's own].
-    #[arg(long, value_name = "FILE|DIR")]
-    weights: Option<PathBuf>,
-    #[command(flatten)]
-    config: ConfigArguments,
-    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
-    #[arg(long, default_value = "auto")]
-    device: String,
-    /// Numbers in the point predictor's matrix products: f32, bf16, or auto: bf16 if the weights were trained in bf16
-    /// and the CPU has instructions for it, else f32.
-    #[arg(long, value_name = "auto|f32|bf16", default_value = "auto", value_parser = precision)]
-    precision: PrecisionChoice,
-}
-
-impl ModelArguments {
-    /// Opens the weights of both networks.
-    pub fn open(&self) -> Result<WeightFile, Failure> {
-        let weights = weights::open(self.weights.as_deref(), &self.config)?;
-        weights.require(Part::PointPredictor)?;
-        weights.require(Part::Regressor)?;
-        Ok(weights)
-    }
-
-    /// The device for many people, if the networks fit into its memory.
-    pub fn device(&self, weights: &WeightFile) -> Result<Device, Failure> {
-        let device = device::choose(&self.device)?;
-        memory::check_networks(weights, &device)?;
-        Ok(device)
-    }
-
-    /// The device for one person, if the networks fit into its memory.
-    fn device_for_one(&self, weights: &WeightFile) -> Result<Device, Failure> {
-        /// Parameters of networks that a CPU needs long for.
-        const MANY: u64 = 100_000_000;
-        let is_small = weights.parameters() < MANY;
-        let device =
-            if is_small { device::choose_for_one(&self.device) } else { device::choose(&self.device) }?;
-        memory::check_networks(weights, &device)?;
-        Ok(device)
-    }
-
-    /// Loads the networks.
-    pub fn load(&self, weights: &WeightFile, device: &Device) -> Result<(Reconstructor, Precision), Failure> {
-        let degrees = weights.config.network.pair_degrees;
-        if degrees != OPPOSITE {
-            bail!(
-                "{}: `network.pair_degrees` is {degrees}: these networks are for several known cameras \
-                 (`views.inputs` of `evaluate`), not for a front and a back",
-                weights.path().display()
-            );
-        }
-        let precision = self.precision.of_weights(&weights.config, device);
-        if !device.supports_dtype(precision.dtype()) {
-            bail!("--device {}: does not compute in {}", self.device, precision.name());
-        }
-        Ok((Reconstructor::load(weights, device)?.in_precision(precision), precision))
-    }
-}
-
-/// Refuses a photograph that memory cannot hold.
-pub fn check_memory(name: &Path, [width, height]: [u32; 2]) -> Result<(), Failure> {
-    let bytes = BYTES_PER_PIXEL * u64::from(width) * u64::from(height);
-    memory::check(&format!("{}, {width}×{height},", name.display()), bytes, "make the picture smaller")
-}
-
-fn precision(text: &str) -> Result<PrecisionChoice, &'static str> {
-    match text {
-        "auto" => Ok(PrecisionChoice::Auto),
-        "f32" => Ok(PrecisionChoice::F32),
-        "bf16" => Ok(PrecisionChoice::Bf16),
-        _ => Err("auto, f32 or bf16"),
-    }
-}
-
 /// The name of the precision, and of the instructions that compute it on the CPU.
 fn in_words(precision: Precision, device: &Device) -> String {
     let name = precision.name();
@@ -231,18 +149,18 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
 
 fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let start = Instant::now();
-    arguments.kind.must_be_unused(ONE)?;
-    arguments.shard.must_be_unused(ONE)?;
+    let Arguments { kind, shard, surface, .. } = arguments;
+    must_be_unused(&[("--kind", kind.kind.is_some()), ("--shard", shard.shard.is_some())], ONE)?;
     let output = arguments.output.as_deref().unwrap_or(Path::new(DEFAULT_OUTPUT));
     let weights = arguments.model.open()?;
     let config = weights.config.clone();
     let mut times = vec![("opening weights", start.elapsed())];
     let mut timed = |name: &'static str, since: Instant| times.push((name, since.elapsed()));
     let turntable = arguments.turntable.as_deref().map(Turntable::new).transpose()?;
-    let target = match &arguments.mesh {
-        Some(path) => Some(Target::new(path, &arguments.surface)?),
-        None => arguments.surface.must_be_unused("without --mesh there is no mesh to shape")?,
-    };
+    let target = arguments.mesh.as_deref().map(|path| Target::new(path, surface)).transpose()?;
+    if target.is_none() {
+        surface.must_be_unused("without --mesh there is no mesh to shape")?;
+    }
     if arguments.masks.is_some() && arguments.cutout == "network" {
         bail!("--cutout network: --masks already tells the person from the background");
     }

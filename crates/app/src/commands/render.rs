@@ -12,12 +12,13 @@ use serde_json::json;
 use snapsnap_base::file;
 use snapsnap_splat::scene;
 use snapsnap_splat::{
-    Camera, Counts, MAX_SIDE, Preset, RenderOptions, Rendered, SplatError, cameras, render,
+    Camera, Counts, MAX_SIDE, Preset, RenderOptions, Rendered, SplatError, camera_file, render,
 };
 
-use super::{check_outputs, one_of};
-use crate::batch::{self, ShardArgument};
+use crate::arguments::one_of;
+use crate::batch::{self, ShardArgument, must_be_unused};
 use crate::failure::{Failure, bail};
+use crate::output::check_outputs;
 use crate::pictures::{picture, read_back};
 use crate::progress::Progress;
 use crate::view_folder::{CAMERAS, ViewFolder};
@@ -82,7 +83,7 @@ pub struct Arguments {
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     if !arguments.ply.is_dir() {
-        arguments.shard.must_be_unused(batch::ONE)?;
+        must_be_unused(&[("--shard", arguments.shard.shard.is_some())], batch::ONE)?;
         return one(arguments, &device::choose(&arguments.device)?);
     }
     if arguments.raw.is_some() {
@@ -114,7 +115,7 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
     check_paths(arguments, folder.as_ref())?;
     if let (Some(path), Some([width, height])) = (&arguments.cameras, arguments.size)
         && folder.as_ref().is_some_and(ViewFolder::keeps_cameras)
-        && cameras::read(path)? != views
+        && camera_file::read(path)? != views
     {
         bail!(
             "--size {width}x{height}: {} describes the pictures beside it, which would have another size: give \
@@ -196,7 +197,7 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
 fn views(arguments: &Arguments) -> Result<Vec<Camera>, Failure> {
     let views = match (&arguments.cameras, arguments.orbit.unwrap_or(0)) {
         (Some(path), _) => {
-            let mut views = cameras::read(path)?;
+            let mut views = camera_file::read(path)?;
             if let Some(size) = arguments.size {
                 resize(&mut views, size, path)?;
             }

@@ -11,7 +11,7 @@ use snapsnap_people::synth;
 use snapsnap_splat::Camera;
 use snapsnap_train::stability as training;
 
-use super::ConfigArguments;
+use crate::arguments::ConfigArguments;
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::report::{ReportFolder, header};

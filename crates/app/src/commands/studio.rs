@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::io::Cursor;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use clap::Args;
@@ -18,12 +18,12 @@ use snapsnap_photo::{Content, Cutting, Source, Told, cut_out, person};
 use snapsnap_splat::scene::Stored;
 use ureq::http::StatusCode;
 
-use super::reconstruct::{ModelArguments, check_memory};
-use crate::downloads::Download;
+use crate::camera_options::CameraArguments;
+use crate::downloads::{self, Download};
 use crate::failure::Failure;
-use crate::page::{self, Job, PageArguments, busy, text};
+use crate::model::{ModelArguments, check_memory};
+use crate::page::{self, Job, PageArguments, text};
 use crate::server::{Answer, Body, Refusal, Request};
-use crate::told::CameraArguments;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -56,8 +56,6 @@ struct Studio {
     made: AtomicUsize,
     /// Start of this server, a part of names: a page of an earlier server finds none of its people here.
     start: u128,
-    /// Locked while a mesh or an animation is made, which takes all cores.
-    long: Mutex<()>,
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
@@ -71,7 +69,6 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         people: Mutex::default(),
         made: AtomicUsize::new(0),
         start: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos()),
-        long: Mutex::new(()),
     };
     page::show(page::Kind::Studio, &arguments.page, "the studio is open", &|request, body| {
         studio.respond(request, body).unwrap_or_else(|refused| refused)
@@ -153,7 +150,7 @@ impl Studio {
         let doubts: Vec<String> = read.doubts.iter().map(ToString::to_string).collect();
         let stored = Stored::of(&person.gaussians).map_err(Failure::from)?;
         // Frees buffers, since the next person may come in an hour.
-        snapsnap_ops::buffers::release();
+        snapsnap_ops::release_buffers();
         drop(networks);
         let name = format!("{:x}-{}", self.start, self.made.fetch_add(1, Ordering::Relaxed));
         let gaussians = stored.len();
@@ -176,18 +173,9 @@ impl Studio {
         drop(people);
         let message = format!("this person is no longer in memory (the last {KEPT} are kept): make it again");
         let stored = found.ok_or_else(|| text(StatusCode::NOT_FOUND, &message))?;
-        let is_long = download.is_long();
-        let content = if is_long && request.method == "HEAD" {
-            Vec::new()
-        } else {
-            let only = is_long.then(|| self.long.try_lock());
-            if matches!(only, Some(Err(TryLockError::WouldBlock))) {
-                return Err(busy());
-            }
-            let job = Job::of(request);
-            download.make(&stored, &|step| job.step(step))?
-        };
-        Ok(page::download(&format!("human.{extension}"), Arc::new(content)))
+        downloads::answer(request, "human", (extension, download), |step| {
+            Ok(Arc::new(download.make(&stored, step)?))
+        })
     }
 }
 

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, LazyLock, Mutex, PoisonError, TryLockError, Weak};
+use std::sync::{Arc, LazyLock, Mutex, PoisonError, Weak};
 use std::time::SystemTime;
 
 use clap::Args;
@@ -11,10 +11,10 @@ use snapsnap_base::FileError;
 use ureq::http::StatusCode;
 
 use super::convert::finite;
-use crate::downloads::Download;
+use crate::downloads::{self, Download};
 use crate::failure::Failure;
-use crate::page::{self, Job, PageArguments, busy, text};
-use crate::server::{Answer, Request};
+use crate::page::{self, PageArguments, busy, text};
+use crate::server::{Answer, Content, Request};
 
 #[derive(Args)]
 pub struct Arguments {
@@ -24,92 +24,69 @@ pub struct Arguments {
     page: PageArguments,
 }
 
-/// Largest number of former contents that slow clients may still be reading.
-const FORMER: usize = 2;
+/// Largest number of former contents that clients may still be reading.
+const MOST_FORMER: usize = 2;
 
 /// Length and time of a file, by which a replaced file is noticed.
 type Stamp = (u64, Option<SystemTime>);
 
-/// The served contents, one of each extension, which all clients share.
-#[derive(Default)]
-struct Made {
-    current: HashMap<&'static str, (Stamp, Arc<Vec<u8>>)>,
-    /// Contents of replaced files.
-    former: Vec<Weak<Vec<u8>>>,
-}
+/// The served contents by extension, with the stamp of their file. All clients share them.
+type Made = Mutex<HashMap<&'static str, (Stamp, Content)>>;
 
-static MADE: LazyLock<Mutex<Made>> = LazyLock::new(Mutex::default);
-/// Locked while a mesh or an animation is made, which takes all cores.
-static LONG: Mutex<()> = Mutex::new(());
+/// The contents that are made at once, and those that take long.
+static MADE: [LazyLock<Made>; 2] = [LazyLock::new(Mutex::default), LazyLock::new(Mutex::default)];
+
+/// Contents of replaced files, which slow clients may still be reading.
+static FORMER: Mutex<Vec<Weak<dyn AsRef<[u8]> + Send + Sync>>> = Mutex::new(Vec::new());
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let input = arguments.input.as_path();
     // Refuses unsuitable files before the browser starts.
     finite(input)?;
     let shows = format!("shows {}", input.display());
-    page::show(page::Kind::View, &arguments.page, &shows, &|request, _| respond(request, input))
+    page::show(page::Kind::View, &arguments.page, &shows, &|request, _| {
+        respond(request, input).unwrap_or_else(|refused| refused)
+    })
 }
 
-fn respond(request: &Request, input: &Path) -> Answer {
+fn respond(request: &Request, input: &Path) -> Result<Answer, Answer> {
     if !page::is_read(request) {
-        return text(StatusCode::METHOD_NOT_ALLOWED, "GET and HEAD only");
+        return Err(text(StatusCode::METHOD_NOT_ALLOWED, "GET and HEAD only"));
     }
     if request.path == "/progress" {
-        return page::progress(request);
+        return Ok(page::progress(request));
     }
-    let Some((extension, download)) = Download::named(request.path.trim_start_matches('/')) else {
-        return text(StatusCode::NOT_FOUND, "no such page");
-    };
-    let job = Job::of(request);
-    let make = || download.make(&finite(input)?.0, &|step| job.step(step));
-    let made = if !download.is_long() {
-        shared(input, extension, false, make)
-    } else if request.method == "HEAD" {
-        finite(input).map(|_| Some(Arc::default()))
-    } else {
-        match LONG.try_lock() {
-            Err(TryLockError::WouldBlock) => Ok(None),
-            _one => shared(input, extension, true, make),
-        }
-    };
-    match made {
-        Ok(None) => busy(),
-        Ok(Some(content)) => {
-            let name = input.with_extension(extension);
-            page::download(&name.file_name().unwrap_or_default().to_string_lossy(), content)
-        }
-        Err(e) => text(StatusCode::UNPROCESSABLE_ENTITY, &e.to_string()),
+    let file = Download::named(request.path.trim_start_matches('/'));
+    let file = file.ok_or_else(|| text(StatusCode::NOT_FOUND, "no such page"))?;
+    if request.method == "HEAD" {
+        finite(input)?;
     }
+    let name = input.file_stem().unwrap_or_default().to_string_lossy();
+    downloads::answer(request, &name, file, |step| shared(input, file, step))
 }
 
-/// The current file's content of this kind, made once. `None` while clients still read too many former contents.
+/// The current file's content of this kind, made once.
 fn shared(
     input: &Path,
-    extension: &'static str,
-    is_long: bool,
-    make: impl FnOnce() -> Result<Vec<u8>, Failure>,
-) -> Result<Option<Arc<Vec<u8>>>, Failure> {
+    (extension, download): (&'static str, Download),
+    step: &dyn Fn(&str),
+) -> Result<Content, Answer> {
     let there = fs::metadata(input).map_err(FileError::read(input))?;
     let stamp = (there.len(), there.modified().ok());
     // One request at a time, since each needs memory for the whole file. Long work goes on beside the others.
-    let mut made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Some((_, content)) = made.current.get(extension).filter(|(of, _)| *of == stamp) {
-        return Ok(Some(content.clone()));
+    let made = &MADE[usize::from(download.is_long())];
+    let mut made = made.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some((_, content)) = made.get(extension).filter(|(of, _)| *of == stamp) {
+        return Ok(content.clone());
     }
-    let former = made.current.remove(extension).map(|(_, content)| Arc::downgrade(&content));
-    made.former.extend(former);
-    made.former.retain(|content| content.strong_count() > 0);
-    if made.former.len() > FORMER {
-        return Ok(None);
+    let mut former = FORMER.lock().unwrap_or_else(PoisonError::into_inner);
+    former.extend(made.remove(extension).map(|(_, content)| Arc::downgrade(&content)));
+    former.retain(|content| content.strong_count() > 0);
+    if former.len() > MOST_FORMER {
+        return Err(busy());
     }
-    let content = if is_long {
-        drop(made);
-        let content = Arc::new(make()?);
-        made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
-        content
-    } else {
-        Arc::new(make()?)
-    };
-    made.current.insert(extension, (stamp, content.clone()));
-    Ok(Some(content))
+    drop(former);
+    let content: Content = Arc::new(download.make(&finite(input)?.0, step)?);
+    made.insert(extension, (stamp, content.clone()));
+    Ok(content)
 }

@@ -7,8 +7,9 @@ use snapsnap_base::config::Schema;
 use snapsnap_net::config::Config;
 use snapsnap_net::weights::{self, Float, ImportOptions, SideHeads};
 
-use super::{ConfigArguments, check_outputs, one_of};
+use crate::arguments::{ConfigArguments, one_of};
 use crate::failure::Failure;
+use crate::output::check_outputs;
 use crate::progress::Progress;
 use crate::say;
 

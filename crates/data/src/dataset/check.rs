@@ -6,10 +6,10 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use super::agree::{LEAST_SIDE, Seen, disagreements};
+use super::consistency::{LEAST_SIDE, Seen, disagreements};
 use super::views::split_alpha;
 use super::write::UNFINISHED;
-use super::{Arrangement, Description, Folder, Layout, Split};
+use super::{Arrangement, DepthMap, Description, Folder, Layout, Person, Split};
 use snapsnap_base::FileError;
 
 /// Largest share of the person without depth. Scans have gaps narrower than a pixel.
@@ -54,16 +54,14 @@ pub fn check(root: &Path, mut progress: impl FnMut(usize, usize)) -> Result<Chec
         progress(done, all.len());
         checked.subjects += 1;
         checked.views += folder.description().views;
-        checked.problems.extend(unexpected(&folder, *split, subject));
-        let found: Vec<(Vec<String>, Option<Seen>)> = (0..folder.description().views)
-            .into_par_iter()
-            .map(|view| faults(&folder, *split, subject, view))
-            .collect();
-        let (problems, seen): (Vec<_>, Vec<_>) = found.into_iter().unzip();
+        let person = folder.person(*split, subject);
+        checked.problems.extend(unexpected(&folder, person));
+        let views = (0..folder.description().views).into_par_iter();
+        let (problems, seen): (Vec<_>, Vec<_>) = views.map(|view| faults(&folder, person, view)).unzip();
         // A fault in a file of all views is reported once.
         let mut reported = HashSet::new();
         checked.problems.extend(problems.into_iter().flatten().filter(|p| reported.insert(p.clone())));
-        let at = folder.path(*split, "img", subject);
+        let at = person.path("img");
         // Views a quarter turn apart are compared; in groups, a photograph with a side.
         let step = match folder.description().arrangement {
             Arrangement::Ring => (seen.len() / 4).max(1),
@@ -92,11 +90,11 @@ fn orphans(folder: &Folder, split: Option<Split>, subjects: &[String]) -> Vec<St
 }
 
 /// Files that belong to none of the views in the description.
-fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<String> {
+fn unexpected(folder: &Folder, person: Person<'_>) -> Vec<String> {
     let views = folder.description().views;
     let mut extra = BTreeSet::new();
     for kind in folder.kinds().iter().filter(|kind| **kind != "cameras") {
-        let path = folder.path(split, kind, subject);
+        let path = person.path(kind);
         for (name, _) in folder.names(&path).unwrap_or_default() {
             let number: String = name.chars().take_while(char::is_ascii_digit).collect();
             if !number.parse().is_ok_and(|view: usize| view < views) {
@@ -108,27 +106,27 @@ fn unexpected(folder: &Folder, split: Option<Split>, subject: &str) -> Vec<Strin
 }
 
 /// Faults of one view's files, and its points and silhouette if all files can be read.
-fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> (Vec<String>, Option<Seen>) {
+fn faults(folder: &Folder, person: Person<'_>, view: usize) -> (Vec<String>, Option<Seen>) {
     let mut problems = Vec::new();
     let mut keep = |e: FileError| problems.push(e.to_string());
     let Description { layout, high_resolution, second_depth, .. } = *folder.description();
     if high_resolution {
-        folder.file(split, subject, view, true).map_err(&mut keep).ok();
+        person.file(view, true).map_err(&mut keep).ok();
     }
-    let picture = folder.file(split, subject, view, false).map_err(&mut keep).ok();
+    let picture = person.file(view, false).map_err(&mut keep).ok();
     let mask = match layout {
         Layout::Exact => picture.map(|picture| split_alpha(picture).1),
-        Layout::Authors => folder.mask(split, subject, view).map_err(&mut keep).ok(),
+        Layout::Authors => person.mask(view).map_err(&mut keep).ok(),
     };
-    let depth = folder.depth_map(split, subject, view).map_err(&mut keep).ok();
-    let second = second_depth.then(|| folder.second_depth(split, subject, view).map_err(&mut keep).ok());
-    let camera = folder.camera(split, subject, view).map_err(&mut keep).ok();
+    let depth = person.depths("depth", view).map_err(&mut keep).ok();
+    let second = second_depth.then(|| person.depths("depth2", view).map_err(&mut keep).ok());
+    let camera = person.camera(view).map_err(&mut keep).ok();
 
-    let at = folder.path(split, "img", subject).join(view.to_string());
+    let at = person.path("img").join(view.to_string());
     let mut report = |problem: String| problems.push(format!("{}: {problem}", at.display()));
     let seen = |v: u8| v >= 128;
-    let person = mask.as_ref().map(|mask| mask.as_raw().iter().filter(|v| seen(**v)).count());
-    if person == Some(0) {
+    let pixels = mask.as_ref().map(|mask| mask.as_raw().iter().filter(|v| seen(**v)).count());
+    if pixels == Some(0) {
         report("its mask is empty".into());
     }
     let (Some(mask), Some(depth)) = (mask, depth) else { return (problems, None) };
@@ -142,19 +140,19 @@ fn faults(folder: &Folder, split: Option<Split>, subject: &str, view: usize) -> 
         .flat_map(|y| (0..width).map(move |x| (x, y)))
         .filter(|&(x, y)| depth[(y * width + x) as usize] <= 0.0 && inside(x, y))
         .count();
-    if missing > 4 && missing as f64 > HOLES * person.unwrap_or(0) as f64 {
+    if missing > 4 && missing as f64 > HOLES * pixels.unwrap_or(0) as f64 {
         report(format!("{missing} pixels of the person have no depth"));
     }
     if let Some(second) = second.flatten() {
-        let before = depth.iter().zip(&second).filter(|(first, second)| **second > 0.0 && second <= first);
-        let bare = depth.iter().zip(&second).filter(|(first, second)| **second > 0.0 && **first <= 0.0);
-        let wrong = before.count() + bare.count();
+        let is_wrong = |(first, second): &(&f32, &f32)| **second > 0.0 && (second <= first || **first <= 0.0);
+        let wrong = depth.iter().zip(&second).filter(is_wrong).count();
         if wrong > 0 {
             report(format!("{wrong} pixels have a second surface that is not behind a first one"));
         }
     }
     // Empty and tiny views cannot be compared.
-    let camera = camera.filter(|_| person != Some(0) && width >= LEAST_SIDE);
-    let seen = camera.map(|camera| Seen::new(&folder.exact_camera(&camera), &mask, &depth));
+    let camera = camera.filter(|_| pixels != Some(0) && width >= LEAST_SIDE);
+    let camera = camera.map(|camera| folder.exact_camera(&camera));
+    let seen = camera.map(|camera| Seen::new(&DepthMap { depth, camera }, &mask));
     (problems, seen)
 }

@@ -1,6 +1,7 @@
 //! The description of a data set, `dataset.toml`.
 
 use std::fmt;
+use std::io::Write;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -165,10 +166,11 @@ pub fn read(path: &Path) -> Result<Description, FileError> {
     }
 }
 
-/// The text of `dataset.toml`.
-pub fn text(description: &Description) -> String {
+/// Writes a description.
+pub fn write(path: &Path, description: &Description) -> Result<(), FileError> {
     let keys = toml::to_string(description).expect("the description has only TOML types");
-    format!("# Written by `snapsnap prepare`.\n{keys}")
+    file::write_whole(path, |out| write!(out, "# Written by `snapsnap prepare`.\n{keys}"))
+        .map_err(FileError::write(path))
 }
 
 /// Differences between two descriptions, key by key.

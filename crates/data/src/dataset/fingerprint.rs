@@ -1,6 +1,6 @@
 //! The fingerprint of a data set, by which a resumed training detects changed pictures.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
@@ -24,20 +24,16 @@ impl Folder {
     /// [`FileError::Read`] for a file or folder that cannot be read.
     pub fn fingerprint(&self, splits: &[Split]) -> Result<String, FileError> {
         let mut files = Vec::new();
-        for split in splits {
-            let folder = self.split_path(Some(*split));
-            if let Some(shards) = &self.shards {
-                files.extend(shards.files(self.below(&folder)).map(Path::to_owned));
-            } else if folder.is_dir() {
-                list(&folder, MAX_DEPTH, &mut files).map_err(FileError::read(&folder))?;
-            }
+        let there = self.splits();
+        for split in splits.iter().map(|split| Some(*split)).filter(|split| there.contains(split)) {
+            self.list(&self.split_path(split), MAX_DEPTH, &mut files)?;
         }
         files.sort_unstable();
         let hashes: Vec<_> = files
             .par_iter()
             .map(|path| {
-                let (length, bytes) = match &self.shards {
-                    Some(shards) => shards.ends(path, ENDS)?,
+                let (length, bytes) = match &self.archives {
+                    Some(archives) => archives.ends(self.below(path), ENDS)?,
                     None => ends(path).map_err(FileError::read(path))?,
                 };
                 Ok(Sha256::new().chain_update(length.to_le_bytes()).chain_update(bytes).finalize())
@@ -46,30 +42,25 @@ impl Folder {
         let mut whole = Sha256::new();
         whole.update(toml::to_string(&self.description).expect("the description has only TOML types"));
         for (path, hash) in files.iter().zip(hashes) {
-            let name = path.strip_prefix(&self.root).unwrap_or(path);
-            whole.update(name.to_string_lossy().as_bytes());
+            whole.update(self.below(path).to_string_lossy().as_bytes());
             whole.update(hash);
         }
         Ok(format!("{:x}", whole.finalize()))
     }
-}
 
-/// Adds the files below a folder. Hidden files are unfinished, and left out.
-fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> io::Result<()> {
-    for entry in fs::read_dir(folder)? {
-        let entry = entry?;
-        if entry.file_name().to_string_lossy().starts_with('.') {
-            continue;
+    /// Adds the files below a folder. Hidden files are unfinished, and left out.
+    fn list(&self, folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<(), FileError> {
+        for (name, is_folder) in self.names(folder).map_err(FileError::read(folder))? {
+            let path = folder.join(&name);
+            match is_folder {
+                _ if name.starts_with('.') => {}
+                false => files.push(path),
+                true if depth > 1 => self.list(&path, depth - 1, files)?,
+                true => {}
+            }
         }
-        // Links are followed, as the reader of views does.
-        let path = entry.path();
-        match fs::metadata(&path)? {
-            metadata if metadata.is_file() => files.push(path),
-            metadata if metadata.is_dir() && depth > 1 => list(&path, depth - 1, files)?,
-            _ => {}
-        }
+        Ok(())
     }
-    Ok(())
 }
 
 /// Length, beginning and end of a file.

@@ -14,13 +14,13 @@
 //! A subject is added whole or not at all: it is written under another name, and its `img` folder, which marks a
 //! subject, is renamed last. [`pack()`] puts all files into tar archives, which are read as the folders are.
 
-mod agree;
+mod archives;
 mod check;
+mod consistency;
 mod description;
 mod files;
 mod fingerprint;
 mod pack;
-mod shards;
 #[cfg(test)]
 mod tests;
 mod views;
@@ -34,14 +34,14 @@ use std::sync::Arc;
 
 use snapsnap_base::{FileError, file};
 
+use archives::Archives;
 pub use check::{Checked, check};
 pub use description::DESCRIPTION;
 pub use description::{Arrangement, Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
 pub use pack::{Packed, pack};
-use shards::Shards;
 use snapsnap_mesh::picture;
-pub use views::StoredView;
-pub(crate) use views::unproject;
+pub(crate) use views::centres;
+pub use views::{DepthMap, Person};
 pub use write::Made;
 
 /// Largest file of a data set that is read.
@@ -53,7 +53,7 @@ pub struct Folder {
     root: PathBuf,
     description: Description,
     /// The archives of a packed data set.
-    shards: Option<Arc<Shards>>,
+    archives: Option<Arc<Archives>>,
 }
 
 /// A file that was read.
@@ -72,8 +72,8 @@ impl Folder {
         let path = root.join(DESCRIPTION);
         if path.is_file() {
             let description = description::read(&path)?;
-            let shards = Shards::open(root)?.map(Arc::new);
-            return Ok(Self { root: root.to_owned(), description, shards });
+            let archives = Archives::open(root)?.map(Arc::new);
+            return Ok(Self { root: root.to_owned(), description, archives });
         }
         fs::read_dir(root).map(drop).map_err(FileError::read(root))?;
         let foreign = |message: &str| {
@@ -94,14 +94,14 @@ impl Folder {
                 source: "written by the authors' tools".into(),
                 drawn: None,
             },
-            shards: None,
+            archives: None,
         };
         let (split, subject) = folder
             .splits()
             .into_iter()
             .find_map(|split| Some((split, folder.subjects(split).ok()?.into_iter().next()?)))
             .ok_or_else(|| foreign("no subject lies in img, train/img, val/img or test/img"))?;
-        let first = folder.path(split, "img", &subject).join("0.jpg");
+        let first = folder.person(split, &subject).picture_path(0);
         let [width, _] = picture::size(&first)?;
         folder.description.resolution = width;
         folder.description.high_resolution = first.with_file_name("0_hr.jpg").is_file();
@@ -128,7 +128,7 @@ impl Folder {
             return Err(FileError::unsuitable(root, message));
         }
         fs::create_dir_all(root).map_err(FileError::write(root))?;
-        if root.join(shards::INDEX).exists() {
+        if root.join(archives::INDEX).exists() {
             return Err(FileError::unsuitable(
                 root,
                 "is packed, and no subjects can be added; give another folder",
@@ -145,11 +145,9 @@ impl Folder {
                 return Err(FileError::unsuitable(&path, message));
             }
         } else {
-            let text = description::text(&description);
-            file::write_whole(&path, |out| io::Write::write_all(out, text.as_bytes()))
-                .map_err(FileError::write(&path))?;
+            description::write(&path, &description)?;
         }
-        Ok(Self { root: root.to_owned(), description, shards: None })
+        Ok(Self { root: root.to_owned(), description, archives: None })
     }
 
     /// The folder's path.
@@ -166,8 +164,8 @@ impl Folder {
     pub fn splits(&self) -> Vec<Option<Split>> {
         let there = |split: &Option<Split>| {
             let folder = self.split_path(*split).join("img");
-            match &self.shards {
-                Some(shards) => shards.files(self.below(&folder)).next().is_some(),
+            match &self.archives {
+                Some(archives) => archives.files(self.below(&folder)).next().is_some(),
                 None => folder.is_dir(),
             }
         };
@@ -189,8 +187,8 @@ impl Folder {
 
     /// Names in a folder of the data set, and whether they are folders.
     fn names(&self, folder: &Path) -> io::Result<Vec<(String, bool)>> {
-        if let Some(shards) = &self.shards {
-            let names = shards.names(self.below(folder));
+        if let Some(archives) = &self.archives {
+            let names = archives.names(self.below(folder));
             return if names.is_empty() { Err(io::ErrorKind::NotFound.into()) } else { Ok(names) };
         }
         let entry = |entry: io::Result<fs::DirEntry>| {
@@ -202,8 +200,8 @@ impl Folder {
 
     /// Reads a file of the data set. `path` is the file's path in a data set of folders, also if the set is packed.
     fn stored(&self, path: &Path) -> Result<Stored, FileError> {
-        let (path, bytes) = match &self.shards {
-            Some(shards) => shards.read(self.below(path))?,
+        let (path, bytes) = match &self.archives {
+            Some(archives) => archives.read(self.below(path))?,
             None => (path.to_owned(), file::read(path, self.largest()).map_err(FileError::read(path))?),
         };
         Ok(Stored { path, bytes })
@@ -236,12 +234,6 @@ impl Folder {
             Some(split) => self.root.join(split.name()),
             None => self.root.clone(),
         }
-    }
-
-    /// A subject's folder with files of one kind, or its file of cameras.
-    fn path(&self, split: Option<Split>, kind: &str, subject: &str) -> PathBuf {
-        let name = if kind == "cameras" { format!("{subject}.json") } else { subject.to_owned() };
-        self.split_path(split).join(kind).join(name)
     }
 }
 

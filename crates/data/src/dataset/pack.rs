@@ -3,21 +3,15 @@
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
-use std::process;
 
 use snapsnap_base::{FileError, file, quoted};
 
+use super::archives::{self, BLOCK, INDEX, Line};
 use super::description::{self, DESCRIPTION};
-use super::shards::{self, BLOCK, INDEX, Line};
-use super::write::remove_left;
 use super::{Folder, Split, Stored};
 
 /// File name of the config of `prepare`, which is copied.
 const SETTINGS: &str = "prepare.config.toml";
-/// Suffix of the name of an unfinished folder.
-const UNFINISHED: &str = ".unfinished";
-/// Suffix of the lock's name, after [`UNFINISHED`].
-const LOCK: &str = ".lock";
 
 /// What was packed.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
@@ -33,8 +27,8 @@ pub struct Packed {
 }
 
 /// Packs a data set of folders into the new folder `output`: archives of about `size` bytes, each with whole subjects.
-/// The folder appears when all files are written. Calls `progress` with the number of packed subjects and of all
-/// subjects. The same data set gives the same bytes.
+/// The description is written last, and makes the folder a data set. Calls `progress` with the number of packed subjects
+/// and of all subjects. The same data set gives the same bytes.
 ///
 /// # Errors
 /// [`FileError`]: `output` exists and is not empty, the data set is packed already, a subject lacks a file or has a
@@ -45,7 +39,7 @@ pub fn pack(
     size: u64,
     mut progress: impl FnMut(usize, usize),
 ) -> Result<Packed, FileError> {
-    if folder.shards.is_some() {
+    if folder.archives.is_some() {
         return Err(FileError::unsuitable(folder.root(), "is packed already"));
     }
     let mut all: Vec<(Option<Split>, String)> = Vec::new();
@@ -60,54 +54,23 @@ pub fn pack(
         Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(FileError::read(output)(e)),
         _ => {}
     }
-    let output = file::target_of(output);
-    let name =
-        output.file_name().ok_or_else(|| FileError::unsuitable(&output, "is no name of a new folder"))?;
-    let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let output = parent.join(name);
-    fs::create_dir_all(parent).map_err(FileError::write(parent))?;
-    let prefix = format!(".{}.", name.to_string_lossy());
-    tidy(parent, &prefix);
-    // Several runs may pack into one folder at once: the first run that ends makes the folder.
-    let temporary = parent.join(format!("{prefix}{}{UNFINISHED}", process::id()));
-    // The system releases the lock of a killed run. Some file systems have no locks.
-    let mark = parent.join(format!("{prefix}{}{UNFINISHED}{LOCK}", process::id()));
-    let lock = File::create(&mark).map_err(FileError::write(&mark))?;
-    let _ = lock.try_lock();
-    let mark = file::unfinished_file(&mark);
-    let made = fs::create_dir(&temporary).and_then(|()| file::unfinished_folder(&temporary));
-    let made = made.map_err(FileError::write(&temporary));
-    let packed = made.and_then(|guard| {
-        let packed = Packer::new(folder, &temporary, size).and_then(|mut packer| {
-            for (done, (split, subject)) in all.iter().enumerate() {
-                progress(done, all.len());
-                packer.add(*split, subject)?;
-            }
-            progress(all.len(), all.len());
-            let packed = packer.finish()?;
-            // An empty folder is replaced.
-            let _ = fs::remove_dir(&output);
-            file::rename(&temporary, &output).map_err(FileError::write(&output))?;
-            Ok(packed)
-        });
-        let _ = fs::remove_dir_all(&temporary);
-        drop(guard);
-        packed
-    });
-    mark.remove();
-    packed
-}
-
-/// Removes the folders of killed runs in `parent`, whose locks are free. Folders of runs in progress stay.
-fn tidy(parent: &Path, prefix: &str) {
-    for mark in fs::read_dir(parent).into_iter().flatten().flatten().map(|entry| entry.path()) {
-        let name = mark.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let left =
-            name.strip_prefix(prefix).and_then(|rest| rest.strip_suffix(LOCK)?.strip_suffix(UNFINISHED));
-        if left.is_some_and(|process| process.parse::<u32>().is_ok()) {
-            remove_left(&mark);
+    let output = &file::target_of(output);
+    let _guard = file::unfinished_folder(output).map_err(FileError::write(output))?;
+    let mut packer = Packer::new(folder, output, size)?;
+    let pack = || {
+        for (done, (split, subject)) in all.iter().enumerate() {
+            progress(done, all.len());
+            packer.add(*split, subject)?;
         }
+        progress(all.len(), all.len());
+        packer.finish()
+    };
+    let packed = pack();
+    match packed {
+        Ok(_) => file::sync_folder(&output.join("..")),
+        Err(_) => drop(fs::remove_dir_all(output)),
     }
+    packed
 }
 
 /// An archive that is being written.
@@ -131,26 +94,21 @@ struct Packer<'a> {
 }
 
 fn create(path: &Path) -> Result<BufWriter<File>, FileError> {
-    File::create(path).map(BufWriter::new).map_err(FileError::write(path))
+    // New: of two runs into one folder, one fails before it has written anything.
+    File::create_new(path).map(BufWriter::new).map_err(FileError::write(path))
 }
 
 impl<'a> Packer<'a> {
     fn new(folder: &'a Folder, output: &'a Path, size: u64) -> Result<Self, FileError> {
-        let path = output.join(DESCRIPTION);
-        fs::write(&path, description::text(folder.description())).map_err(FileError::write(&path))?;
-        let settings = folder.root().join(SETTINGS);
-        if settings.is_file() {
-            fs::copy(&settings, output.join(SETTINGS)).map_err(FileError::write(&output.join(SETTINGS)))?;
-        }
         let index = csv::Writer::from_writer(create(&output.join(INDEX))?);
         Ok(Self { folder, output, size, index, open: None, next: 0, packed: Packed::default() })
     }
 
     fn add(&mut self, split: Option<Split>, subject: &str) -> Result<(), FileError> {
+        let person = self.folder.person(split, subject);
         if subject.contains('.') {
-            let folder = self.folder.path(split, "img", subject);
             let message = "a full stop in a subject's name is not possible in WebDataset's archives: rename the subject's folders";
-            return Err(FileError::unsuitable(&folder, message));
+            return Err(FileError::unsuitable(&person.path("img"), message));
         }
         if self.open.as_ref().is_some_and(|open| open.split != split) {
             self.close()?;
@@ -160,14 +118,14 @@ impl<'a> Packer<'a> {
             self.close()?;
         }
         if self.open.is_none() {
-            let path = self.output.join(shards::archive_name(split, self.next));
+            let path = self.output.join(archives::archive_name(split, self.next));
             self.next += 1;
             self.open = Some(Open { split, out: tar::Builder::new(create(&path)?), path, at: 0 });
         }
         for (kind, name) in self.files() {
-            let path = self.folder.path(split, kind, subject);
+            let path = person.path(kind);
             let path = if kind == "cameras" { path } else { path.join(&name) };
-            self.append(&shards::member_name(kind, subject, &name), &self.folder.stored(&path)?)?;
+            self.append(&archives::member_name(kind, subject, &name), &self.folder.stored(&path)?)?;
         }
         self.packed.subjects += 1;
         Ok(())
@@ -200,7 +158,7 @@ impl<'a> Packer<'a> {
     fn append(&mut self, member: &str, stored: &Stored) -> Result<(), FileError> {
         let open = self.open.as_mut().expect("opened by `add`");
         let archive = open.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if shards::path_of(&archive, member).is_none() {
+        if archives::path_of(&archive, member).is_none() {
             let message = format!("`{}` is no name in an archive", quoted(member));
             return Err(FileError::unsuitable(&stored.path, message));
         }
@@ -243,6 +201,13 @@ impl<'a> Packer<'a> {
             out.get_ref().sync_all()
         });
         synced.map_err(FileError::write(&path))?;
+        let settings = self.folder.root().join(SETTINGS);
+        if settings.is_file() {
+            let bytes = fs::read(&settings).map_err(FileError::read(&settings))?;
+            let path = self.output.join(SETTINGS);
+            file::write_whole(&path, |out| out.write_all(&bytes)).map_err(FileError::write(&path))?;
+        }
+        description::write(&self.output.join(DESCRIPTION), self.folder.description())?;
         Ok(self.packed)
     }
 }

@@ -2,15 +2,22 @@ mod pack;
 
 use super::*;
 use crate::prepare::{DataConfig, Subject};
-use crate::testing::{block, data_set, rectangle};
+use crate::testing::{block, data_set, made, rectangle};
 use glam::Vec3;
 use snapsnap_mesh::mesh::Face;
-use snapsnap_splat::{Camera, cameras};
+use snapsnap_splat::{Camera, camera_file};
 
 const TRAIN: Option<Split> = Some(Split::Train);
 
 fn small(layout: Layout) -> (tempfile::TempDir, Arc<Folder>) {
-    data_set(&rectangle().0, layout, 64, 4, true, 2)
+    made(&config(layout), &rectangle().0, 2)
+}
+
+fn config(layout: Layout) -> DataConfig {
+    let mut config = DataConfig::default();
+    (config.views.layout, config.views.count, config.views.resolution) = (layout, 4, 64);
+    config.views.high_resolution = true;
+    config
 }
 
 #[test]
@@ -21,15 +28,17 @@ fn what_was_written_is_read_again() {
         assert_eq!(folder.description(), written.description());
         assert_eq!(folder.splits(), [TRAIN]);
         assert_eq!(folder.subjects(TRAIN).expect("lists"), ["0000", "0001"]);
-        let view = folder.view(TRAIN, "0001", 2).expect("reads");
+        let person = folder.person(TRAIN, "0001");
+        let view = person.depth(2).expect("reads");
         let expected = Camera::orbit_at_yaw_degrees(180.0, 64);
         let off = (view.camera.world_to_camera.translation - expected.world_to_camera.translation).length();
         assert!(off < 1e-12 && view.camera.focal == expected.focal, "{layout:?}: {:?}", view.camera);
         assert_eq!(view.camera.principal_point, expected.principal_point);
         let middle = 37 * 64 + 32;
         assert!((view.depth[middle] - 2.0).abs() < 0.15, "{}", view.depth[middle]);
-        assert_eq!(view.mask.as_raw()[middle], 255);
-        let (large, _) = folder.picture(TRAIN, "0001", 2, true).expect("reads");
+        let (_, mask) = person.picture(2, false).expect("reads");
+        assert_eq!(mask.as_raw()[middle], 255);
+        let (large, _) = person.picture(2, true).expect("reads");
         assert_eq!(large.dimensions(), (128, 128));
         let checked = check(folder.root(), |_, _| {}).expect("checks");
         assert_eq!((checked.subjects, checked.views, checked.problems), (2, 8, Vec::<String>::new()));
@@ -39,21 +48,18 @@ fn what_was_written_is_read_again() {
 /// Two views of a block behind a rectangle, from the front and the back.
 #[test]
 fn second_surfaces_are_stored_and_checked() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
     let mut config = DataConfig::default();
-    config.views =
-        crate::prepare::ViewsConfig { count: 2, resolution: 64, second_depth: true, ..config.views };
-    let folder = Folder::create(temporary.path(), config.description("a test")).expect("creates");
+    (config.views.count, config.views.resolution, config.views.second_depth) = (2, 64, true);
     let mut mesh = block();
     let first = mesh.positions.len() as u32;
     // A thin slab in front of the block.
     let slab = block();
     mesh.positions.extend(slab.positions.iter().map(|p| *p * Vec3::new(0.5, 1.0, 0.2) + 0.4 * Vec3::Z));
     mesh.faces.extend(slab.faces.iter().map(|f| Face { positions: f.positions.map(|r| r + first), ..*f }));
-    config.add(&folder, &Subject::plain(Split::Train, "0000"), &mesh).expect("adds");
+    let (_temporary, folder) = made(&config, &mesh, 1);
+    let person = folder.person(TRAIN, "0000");
     let of = |view: usize| {
-        let first = folder.depth(TRAIN, "0000", view).expect("reads").depth;
-        (first, folder.second_depth(TRAIN, "0000", view).expect("reads"))
+        (person.depths("depth", view).expect("reads"), person.depths("depth2", view).expect("reads"))
     };
     // The slab hides a part of the block from the front, and the block all of the slab from behind.
     let (front, back) = (of(0), of(1));
@@ -90,17 +96,18 @@ fn folders_of_the_authors_tools_are_recognised() {
     }
     let folder = Folder::open(root).expect("opens");
     assert_eq!(folder.splits(), [None]);
-    assert_eq!(folder.view(None, "0000", 0).expect("reads").depth.len(), 64 * 64);
+    let person = folder.person(None, "0000");
+    assert_eq!(person.depth(0).expect("reads").depth.len(), 64 * 64);
 
     // Matrices in f32, as some of the authors' tools write them.
     let path = root.join("parm/0000/0_extrinsic.npy");
-    let camera = folder.camera(None, "0000", 0).expect("reads");
+    let camera = person.camera(0).expect("reads");
     let rotation = camera.world_to_camera.rotation;
     let matrix = ndarray::Array2::from_shape_fn((3, 4), |(r, c)| {
         (if c < 3 { rotation.row(r)[c] } else { camera.world_to_camera.translation[r] }) as f32
     });
     ndarray_npy::write_npy(&path, &matrix).expect("writes");
-    let again = folder.camera(None, "0000", 0).expect("reads");
+    let again = person.camera(0).expect("reads");
     assert!((again.world_to_camera.translation - camera.world_to_camera.translation).length() < 1e-6);
 }
 
@@ -133,17 +140,17 @@ fn a_killed_run_leaves_no_half_subject() {
     assert!(!folder.has(Split::Train, "0002"));
     let problems = check(root, |_, _| {}).expect("checks").problems;
     assert_eq!(problems.len(), 2, "{problems:?}");
-    let mut config = DataConfig::default();
-    config.views =
-        crate::prepare::ViewsConfig { count: 4, resolution: 64, high_resolution: true, ..config.views };
-    config.add(&folder, &Subject::plain(Split::Train, "0002"), &rectangle().0).expect("adds");
+    let add = || {
+        let subject = Subject::plain(Split::Train, "0002");
+        config(Layout::Exact).add(&folder, &subject, &rectangle().0).expect("adds")
+    };
+    assert_eq!(add(), Made::Whole);
     assert!(folder.has(Split::Train, "0002"));
     // A subject of a run in progress is not touched.
     fs::remove_dir_all(root.join("train/img/0002")).expect("remove");
     fs::create_dir_all(root.join(".unfinished")).expect("make");
     let lock = fs::File::create(root.join(".unfinished/train-0002.lock")).expect("create");
     lock.try_lock().expect("free");
-    let add = || config.add(&folder, &Subject::plain(Split::Train, "0002"), &rectangle().0).expect("adds");
     assert_eq!(add(), Made::Elsewhere);
     drop(lock);
     assert_eq!(add(), Made::Whole);
@@ -165,7 +172,7 @@ fn a_check_lists_everything_that_is_wrong() {
     let empty = image::RgbaImage::new(64, 64);
     empty.save(at("img/0001/0.png")).expect("save");
     let write_depth = |view: usize, change: fn(&mut Vec<f32>)| {
-        let mut depth = folder.depth(TRAIN, "0001", view).expect("reads").depth;
+        let mut depth = folder.person(TRAIN, "0001").depths("depth", view).expect("reads");
         change(&mut depth);
         files::write_depth(&at(&format!("depth/0001/{view}.npz")), [64, 64], &depth).expect("writes");
     };
@@ -225,18 +232,13 @@ fn depths_that_the_authors_layout_cannot_store_are_refused() {
         p.x = 1.6 * p.x.signum();
         p.z = 1.6 * p.z.signum();
     });
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let mut config = DataConfig::default();
-    config.views =
-        crate::prepare::ViewsConfig { count: 4, resolution: 64, layout: Layout::Authors, ..config.views };
-    let folder =
-        Folder::create(&temporary.path().join("a_64_4"), config.description("walls")).expect("makes");
-    let refused = config.add(&folder, &Subject::plain(Split::Train, "0000"), &wall).expect_err("too near");
+    let (_temporary, folder) = made(&config(Layout::Authors), &wall, 0);
+    let subject = Subject::plain(Split::Train, "0000");
+    let refused = config(Layout::Authors).add(&folder, &subject, &wall).expect_err("too near");
     assert!(refused.to_string().contains("within half a metre"), "{refused}");
     assert!(!folder.has(Split::Train, "0000"));
-    config.views.layout = Layout::Exact;
-    let folder = Folder::create(&temporary.path().join("b"), config.description("walls")).expect("makes");
-    config.add(&folder, &Subject::plain(Split::Train, "0000"), &wall).expect("f32 stores them");
+    // 32 bits store them.
+    made(&config(Layout::Exact), &wall, 1);
 }
 
 /// Each file of the authors' layout is checked, also if other files are faulty.
@@ -280,13 +282,15 @@ fn a_check_reports_cameras_that_do_not_fit_their_views() {
         let (_temporary, folder) = data_set(crate::testing::person(), layout, 256, 8, false, 1);
         assert!(check(folder.root(), |_, _| {}).expect("checks").problems.is_empty());
         let cameras: Vec<Camera> =
-            (0..8).map(|view| folder.camera(TRAIN, "0000", view).expect("reads")).collect();
+            (0..8).map(|view| folder.person(TRAIN, "0000").camera(view).expect("reads")).collect();
         for (name, change) in changes {
             let mut cameras = cameras.clone();
             change(&mut cameras[3]);
             let train = folder.root().join("train");
             match layout {
-                Layout::Exact => cameras::write(&cameras, &train.join("cameras/0000.json")).expect("writes"),
+                Layout::Exact => {
+                    camera_file::write(&cameras, &train.join("cameras/0000.json")).expect("writes");
+                }
                 Layout::Authors => {
                     files::write_camera(&train.join("parm/0000"), 3, &cameras[3]).expect("writes");
                 }
@@ -313,8 +317,7 @@ fn unfinished_subjects_are_faults_and_names_are_checked() {
     let problems = check(folder.root(), |_, _| {}).expect("checks").problems;
     assert!(problems.len() == 1 && problems[0].contains("was killed"), "{problems:?}");
 
-    let mut config = DataConfig::default();
-    (config.views.count, config.views.resolution) = (4, 64);
+    let config = config(Layout::Exact);
     for name in ["", ".", "..", ".hid", "a/b", "../train"] {
         let subject = Subject::plain(Split::Train, name);
         let error = config.add(&folder, &subject, &rectangle().0).expect_err(name).to_string();

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use rayon::prelude::*;
 use snapsnap_base::{FileError, file, quoted};
-use snapsnap_splat::{Camera, cameras};
+use snapsnap_splat::{Camera, camera_file};
 
 use super::{Folder, Layout, Split, files};
 use snapsnap_mesh::view::View;
@@ -25,7 +25,7 @@ pub enum Made {
 
 /// Removes the folder of a killed run and the folder's lock `mark`, which has the folder's name and the extension
 /// `lock`. A folder of a run in progress stays.
-pub(super) fn remove_left(mark: &Path) {
+fn remove_left(mark: &Path) {
     let Ok(lock) = fs::File::open(mark) else { return };
     // A run in progress holds its lock. This one is held until the folder is removed.
     if lock.try_lock().is_ok() {
@@ -38,8 +38,9 @@ impl Folder {
     /// Whether the subject is complete: the last view has a file of every kind.
     pub fn has(&self, split: Split, subject: &str) -> bool {
         let last = self.description.views - 1;
+        let person = self.person(Some(split), subject);
         self.kinds().iter().all(|kind| {
-            let path = self.path(Some(split), kind, subject);
+            let path = person.path(kind);
             let last = match *kind {
                 "cameras" => path,
                 "parm" => path.join(format!("{last}_extrinsic.npy")),
@@ -173,15 +174,16 @@ impl Folder {
         // The error of the first failed view, in any order of the threads.
         views.collect::<Vec<_>>().into_iter().collect::<Result<(), _>>()?;
         if self.description.layout == Layout::Exact {
-            cameras::write(cameras, &folder.join("cameras"))?;
+            camera_file::write(cameras, &folder.join("cameras"))?;
         }
         Ok(())
     }
 
     /// Moves a complete subject to its place, `img` last.
     fn reveal(&self, temporary: &Path, split: Split, subject: &str) -> Result<(), FileError> {
+        let person = self.person(Some(split), subject);
         for kind in self.kinds().iter().rev() {
-            let (from, to) = (temporary.join(kind), self.path(Some(split), kind, subject));
+            let (from, to) = (temporary.join(kind), person.path(kind));
             let parent = to.parent().unwrap_or(&self.root);
             fs::create_dir_all(parent).map_err(FileError::write(parent))?;
             // A folder of an incomplete subject.

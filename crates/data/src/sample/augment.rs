@@ -4,11 +4,17 @@ use std::io::Cursor;
 
 use glam::Vec3;
 use image::codecs::jpeg::JpegEncoder;
-use image::{GrayImage, Rgb, RgbImage};
+use image::{GrayImage, Luma, Rgb, RgbImage};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use snapsnap_base::config::outside;
+use snapsnap_photo::Rect;
+
+/// Largest change of red and blue against green, as a share.
+const WHITE_BALANCE: f32 = 0.06;
+/// Lowest JPEG quality of photographs.
+const LOWEST_QUALITY: f32 = 70.0;
 
 /// Ranges of the changes; 0 or false disables one. Front and back are changed independently.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -16,18 +22,14 @@ use snapsnap_base::config::outside;
 pub struct Augment {
     /// Largest change of brightness, as a share.
     pub exposure: f32,
-    /// Largest change of red and blue against green, as a share.
-    pub white_balance: f32,
     /// Largest error of masks that are too small, in pixels.
     pub mask_erosion: f32,
     /// Largest error of masks that are too large, in pixels.
     pub mask_dilation: f32,
-    /// Lowest JPEG quality of photographs, 1 to 100; 0: no compression.
-    pub jpeg_quality: u8,
-    /// Whether photographs have random backgrounds, which are visible through soft or too large masks.
-    pub background: bool,
-    /// Stage 2: whether targets have a random colour instead of black as their background.
-    pub background_color: bool,
+    /// Whether photographs have a random white balance, the losses of JPEG, and random backgrounds, which are visible
+    /// through soft or too large masks. In stage 2, targets have a random colour behind the person instead of black.
+    #[serde(skip)]
+    pub is_photographic: bool,
     /// Stage 1: whether half of the samples are mirrored.
     pub flip: bool,
 }
@@ -35,41 +37,21 @@ pub struct Augment {
 impl Default for Augment {
     /// Augmentation of this program's own trainings.
     fn default() -> Self {
-        Self {
-            exposure: 0.15,
-            white_balance: 0.06,
-            mask_erosion: 1.5,
-            mask_dilation: 1.5,
-            jpeg_quality: 70,
-            background: true,
-            background_color: true,
-            flip: false,
-        }
+        Self { exposure: 0.15, mask_erosion: 1.5, mask_dilation: 1.5, is_photographic: true, flip: false }
     }
 }
 
 impl Augment {
     /// No augmentation.
     pub fn none() -> Self {
-        Self {
-            exposure: 0.0,
-            white_balance: 0.0,
-            mask_erosion: 0.0,
-            mask_dilation: 0.0,
-            jpeg_quality: 0,
-            background: false,
-            background_color: false,
-            flip: false,
-        }
+        Self { exposure: 0.0, mask_erosion: 0.0, mask_dilation: 0.0, is_photographic: false, flip: false }
     }
 
     pub(super) fn problem(&self) -> Option<(&'static str, String)> {
         outside([
             ("exposure", self.exposure, 0.0..=0.9),
-            ("white_balance", self.white_balance, 0.0..=0.9),
             ("mask_erosion", self.mask_erosion, 0.0..=16.0),
             ("mask_dilation", self.mask_dilation, 0.0..=16.0),
-            ("jpeg_quality", f32::from(self.jpeg_quality), 0.0..=100.0),
         ])
     }
 
@@ -82,15 +64,16 @@ impl Augment {
     ) -> (RgbImage, GrayImage) {
         let mut stray = |range: f32| 1.0 + range * random.random_range(-1.0_f32..1.0);
         let exposure = stray(self.exposure);
-        let gain = Vec3::new(stray(self.white_balance), 1.0, stray(self.white_balance)) * exposure;
+        let balance = if self.is_photographic { WHITE_BALANCE } else { 0.0 };
+        let gain = Vec3::new(stray(balance), 1.0, stray(balance)) * exposure;
         let grow = random.random_range(-1.0_f32..1.0);
         let quality = random.random_range(0.0_f32..1.0);
         let backdrop = Backdrop::draw(random);
         let mut picture = color.clone();
-        if self.background || gain != Vec3::ONE {
+        if self.is_photographic || gain != Vec3::ONE {
             for (x, y, pixel) in picture.enumerate_pixels_mut() {
                 let lit = (Vec3::from(pixel.0.map(f32::from)) * gain).clamp(Vec3::ZERO, Vec3::splat(255.0));
-                let mixed = if self.background {
+                let mixed = if self.is_photographic {
                     let share = f32::from(mask.get_pixel(x, y).0[0]) / 255.0;
                     backdrop
                         .color(x as f32 / color.width() as f32, y as f32 / color.height() as f32)
@@ -101,9 +84,8 @@ impl Augment {
                 *pixel = Rgb(mixed.to_array().map(|c| c.round() as u8));
             }
         }
-        if self.jpeg_quality > 0 {
-            let lowest = f32::from(self.jpeg_quality);
-            picture = compressed(picture, (lowest + quality * (100.0 - lowest)) as u8);
+        if self.is_photographic {
+            picture = compressed(picture, (LOWEST_QUALITY + quality * (100.0 - LOWEST_QUALITY)) as u8);
         }
         let reach = if grow < 0.0 { grow * self.mask_erosion } else { grow * self.mask_dilation };
         let mask = if reach == 0.0 { mask.clone() } else { moved(mask, reach) };
@@ -158,36 +140,24 @@ pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
         let value = if inside { mask.as_raw()[(y * width + x) as usize] } else { 0 };
         if dilate { value } else { 255 - value }
     };
-    // Squares of pixels with anything in them. A disc reaches at most into the squares beside its own.
-    let square = whole.max(8);
-    let squares = [width, height].map(|side| side.div_euclid(square) + 1);
-    let mut filled = vec![false; (squares[0] * squares[1]) as usize];
-    for y in 0..height {
-        for x in 0..width {
-            filled[(y / square * squares[0] + x / square) as usize] |= at(x, y) > 0;
+    let mut changed = mask.clone();
+    let Some(person) = Rect::around(mask, 1) else { return changed };
+    // Further away, a mask stays empty.
+    let around = |from: u32, size: u32, side: i64| {
+        let (from, to) = (i64::from(from), i64::from(from + size));
+        (from - whole).max(0)..(to + whole).min(side)
+    };
+    for y in around(person.y, person.height, height) {
+        for x in around(person.x, person.width, width) {
+            // A full pixel cannot grow.
+            if at(x, y) < 255 {
+                let grown = disc.iter().map(|(dx, dy, share)| f32::from(at(x + dx, y + dy)) * share);
+                let value = grown.fold(0.0, f32::max) as u8;
+                changed.put_pixel(x as u32, y as u32, Luma([if dilate { value } else { 255 - value }]));
+            }
         }
     }
-    let near = |x: i64, y: i64| {
-        let (x, y) = (x / square, y / square);
-        (y - 1..=y + 1).any(|y| {
-            (x - 1..=x + 1).any(|x| {
-                // A mask is empty outside the picture. Erosion makes the empty part grow.
-                let inside = (0..squares[0]).contains(&x) && (0..squares[1]).contains(&y);
-                if inside { filled[(y * squares[0] + x) as usize] } else { !dilate }
-            })
-        })
-    };
-    GrayImage::from_fn(mask.width(), mask.height(), |x, y| {
-        let (x, y) = (i64::from(x), i64::from(y));
-        let here = at(x, y);
-        // Most pixels are far from the outline. A full pixel cannot grow.
-        let value = if here == 255 || !near(x, y) {
-            here
-        } else {
-            disc.iter().map(|(dx, dy, share)| f32::from(at(x + dx, y + dy)) * share).fold(0.0, f32::max) as u8
-        };
-        image::Luma([if dilate { value } else { 255 - value }])
-    })
+    changed
 }
 
 #[cfg(test)]
@@ -198,7 +168,7 @@ mod tests {
     fn disc(radius: f32) -> GrayImage {
         GrayImage::from_fn(64, 64, |x, y| {
             let d = ((x as f32 - 31.5).powi(2) + (y as f32 - 31.5).powi(2)).sqrt();
-            image::Luma([((radius + 0.5 - d).clamp(0.0, 1.0) * 255.0) as u8])
+            Luma([((radius + 0.5 - d).clamp(0.0, 1.0) * 255.0) as u8])
         })
     }
 

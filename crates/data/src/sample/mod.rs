@@ -1,9 +1,9 @@
 //! Training samples: Burn data sets of both stages, batches, and a loader (docs/method.md, "Samples").
 
 mod augment;
-mod handling;
+mod four_views;
 mod loader;
-mod place;
+mod photograph_changes;
 mod rectified;
 mod stage1;
 mod stage2;
@@ -22,10 +22,10 @@ use snapsnap_net::Photograph;
 use snapsnap_photo::{Cutting, Photographs, Placement, Source as Picture};
 use snapsnap_splat::Camera;
 
-use crate::dataset::{Arrangement, Description, Folder, Layout, Split};
+use crate::dataset::{Arrangement, Description, Folder, Layout, Person, Split};
 pub use augment::Augment;
-pub use handling::{Handling, Road};
 pub use loader::{Batches, Loader, share};
+pub use photograph_changes::{PhotographChanges, Road};
 use snapsnap_base::FileError;
 use snapsnap_base::config::outside;
 use snapsnap_base::random::stream;
@@ -43,21 +43,25 @@ const INSIDE: u8 = 128;
 #[serde(deny_unknown_fields, default)]
 pub struct SampleConfig {
     /// Whether samples have every quirk of the published loader: points half a pixel off in sets that are sampled at
-    /// the pixels' corners, a black background, and no augmentation.
+    /// the pixels' corners, a black background, and no augmentation: `mode.compat`.
+    #[serde(skip)]
     pub compat: bool,
     /// Samples of each subject in an epoch.
+    #[serde(skip)]
     pub repeat: usize,
     /// Largest angle, in degrees, between the front photograph and the subject's own front; 180: any view is a front.
     pub front_within_degrees: f32,
     /// Stage 2: number of random target views, beside the two side views.
     pub random_targets: usize,
-    /// Stage 2: whether targets have twice the side. The data set must contain such views.
+    /// Stage 2: whether targets have twice the side, as published. The data set must contain such views.
+    #[serde(skip)]
     pub high_resolution: bool,
     /// Stage 2: whether samples contain the points of all views for stage 1's loss: `stage2.points_weight`.
     #[serde(skip)]
     pub points: bool,
     /// Stage 1: whether samples with sides contain the second surface that faces each side camera, such as the flank
-    /// behind an arm. The data set must contain it: `views.second_depth`.
+    /// behind an arm: `network.second_layer`. The data set must contain it: `views.second_depth`.
+    #[serde(skip)]
     pub second_depth: bool,
     /// Share of the samples whose photographs are placed on their canvas like a user's photographs. The points of these
     /// samples are scaled and moved into the nominal cameras' views. If the distance or focal length of rigs varies,
@@ -76,7 +80,8 @@ pub struct SampleConfig {
     /// Degrees between the two photographs' cameras: `network.pair_degrees`.
     #[serde(skip)]
     pub pair_degrees: f64,
-    /// Seed of everything that is random.
+    /// Seed of everything that is random: `training.seed`.
+    #[serde(skip)]
     pub seed: u64,
     /// Changes to the two input photographs.
     pub augment: Augment,
@@ -113,7 +118,6 @@ impl SampleConfig {
     /// The first invalid key, and why it is invalid.
     pub fn problem(&self) -> Option<(String, String)> {
         let ranges = [
-            ("repeat", self.repeat as f32, 1.0..=1e6),
             ("front_within_degrees", self.front_within_degrees, 0.0..=180.0),
             ("random_targets", self.random_targets as f32, 0.0..=64.0),
             ("placed_share", self.placed_share, 0.0..=1.0),
@@ -129,11 +133,10 @@ impl SampleConfig {
             ("front_within_degrees", "must be 180", self.front_within_degrees != 180.0),
             ("augment", "must be off", self.augment != Augment::none()),
             ("placed_share", "must be 0", self.placed_share > 0.0),
-            ("second_depth", "must be false", self.second_depth),
             ("upright", "must be false", self.upright),
         ];
         if let Some((key, message, _)) = beside_compat.into_iter().find(|(.., wrong)| self.compat && *wrong) {
-            return Some((key.into(), format!("{message} with `compat = true`")));
+            return Some((key.into(), format!("{message} with `mode.compat = true`")));
         }
         // Photographs of neighbouring views keep their known cameras.
         let beside_neighbours = [
@@ -212,13 +215,13 @@ impl Source {
             )));
         }
         if config.compat && folder.description().arrangement != Arrangement::Ring {
-            return Err(wrong("is arranged in groups, which `compat = true` does not support".into()));
+            return Err(wrong("is arranged in groups, which `mode.compat = true` does not support".into()));
         }
         if config.high_resolution && !folder.description().high_resolution {
-            return Err(wrong("has no views at twice the side, which `high_resolution` needs".into()));
+            return Err(wrong("has no views at twice the side, which `mode.compat = true` needs".into()));
         }
         if config.sides && config.second_depth && !folder.description().second_depth {
-            return Err(wrong("has no second surfaces, which `second_depth` needs".into()));
+            return Err(wrong("has no second surfaces, which `network.second_layer` needs".into()));
         }
         if config.pair_degrees != OPPOSITE {
             let steps = steps_of(config.pair_degrees, views);
@@ -240,11 +243,11 @@ impl Source {
         self.subjects.len() * self.config.repeat
     }
 
-    /// The subject of a sample and its random stream. As in the published code, subjects take turns.
-    fn subject(&self, stage: u32, index: usize) -> (&str, ChaCha8Rng) {
+    /// The person of a sample and its random stream. As in the published code, people take turns.
+    fn person(&self, stage: u32, index: usize) -> (Person<'_>, ChaCha8Rng) {
         let subject = &self.subjects[index % self.subjects.len()];
         let random = stream(&format!("sample/{stage}/{}/{}/{index}", self.config.seed, self.epoch));
-        (subject, random)
+        (self.folder.person(self.split, subject), random)
     }
 
     /// Draws the view of the front photograph. In groups, it is the front of a random group.
@@ -279,12 +282,12 @@ impl Source {
     /// A target view: `[3,h,w]` in [0, 1] over `background`, and the person's share of each pixel `[h,w]`.
     fn target(
         &self,
-        subject: &str,
+        person: Person<'_>,
         view: usize,
         high_resolution: bool,
         background: [f32; 3],
     ) -> Result<(Vec<f32>, Vec<f32>), FileError> {
-        let (color, mask) = self.folder.picture(self.split, subject, view, high_resolution)?;
+        let (color, mask) = person.picture(view, high_resolution)?;
         // The authors' pictures already have a black background. Masks have half the side of their large pictures.
         let is_done = self.folder.description().layout == Layout::Authors && background == [0.0; 3];
         let value = |c: u8, a: u8, behind: f32| {
@@ -302,18 +305,17 @@ impl Source {
     /// Photographs of front and back as the networks' input: placed on their canvases like a user's, or used unchanged.
     fn photographs(
         &self,
-        subject: &str,
+        person: Person<'_>,
         views: [usize; 2],
-        pictures: [(&RgbImage, &GrayImage); 2],
-        is_placed: bool,
+        pictures: &[(RgbImage, GrayImage)],
         random: &mut impl Rng,
     ) -> Result<Photographs, FileError> {
-        let paths = views.map(|view| self.folder.picture_path(self.split, subject, view));
-        let changed = pictures.map(|(color, mask)| self.config.augment.apply(color, mask, random));
+        let height = self.config.person_height;
+        let placement = if self.is_placed(random) { Placement::Training { height } } else { Placement::AsIs };
+        let paths = views.map(|view| person.picture_path(view));
+        let changed = [0, 1].map(|i| self.config.augment.apply(&pictures[i].0, &pictures[i].1, random));
         let source = |i: usize| Picture::pixels(&paths[i], &changed[i].0, Some(&changed[i].1));
         let sources = [source(0), source(1)];
-        let height = self.config.person_height;
-        let placement = if is_placed { Placement::Training { height } } else { Placement::AsIs };
         let side = changed[0].0.width() as usize;
         let mut made = snapsnap_photo::read(&sources, Cutting::Given, side, placement, None)?;
         if self.config.compat {
@@ -342,9 +344,4 @@ impl Source {
 /// Number of steps between the views of a ring that span `degrees`; fractional if no view is there.
 fn steps_of(degrees: f64, views: usize) -> f64 {
     degrees * views as f64 / 360.0
-}
-
-/// Front and back.
-fn pair(canvases: Vec<Photograph>) -> [Photograph; 2] {
-    canvases.try_into().expect("two photographs")
 }

@@ -7,8 +7,13 @@ use glam::{DVec2, DVec3};
 use snapsnap_photo::{AXIS, Mapping, PlaneMap, Restoration, nominal, turn_to_front, turned};
 use snapsnap_splat::{Camera, RigidTransform};
 
-use super::place::{LOOKUPS, Seen, centres};
-use crate::dataset::StoredView;
+use crate::dataset::{DepthMap, centres};
+
+/// Iterations of the search for a side pixel's depth.
+const LOOKUPS: usize = 3;
+
+/// Points of a canvas's pixels, row by row, in the front's frame; `None` for pixels without a point.
+type Seen = Vec<Option<DVec3>>;
 
 /// Moves points between the turned world and the nominal cameras' world. Both have the subject at the origin and y up.
 pub(super) struct Rectification {
@@ -47,7 +52,7 @@ impl Rectification {
     }
 
     /// Rectified points of a photograph's canvas, in the nominal front camera's frame.
-    pub(super) fn photographed(&self, view: &StoredView, photograph: usize) -> Seen {
+    pub(super) fn photographed(&self, view: &DepthMap, photograph: usize) -> Seen {
         let to_world = self.cameras[photograph].world_to_camera.inverse();
         let seen = |place: DVec2| {
             let point = to_world.apply(view.point(self.mappings[photograph].source(place))?);
@@ -58,7 +63,7 @@ impl Rectification {
 
     /// Rectified points of a side, in the nominal front camera's frame. The side's nominal camera stands `degrees`
     /// around the body's axis from the front camera; `view` is the data set's view of the side.
-    pub(super) fn of_side(&self, view: &StoredView, degrees: f64) -> Seen {
+    pub(super) fn of_side(&self, view: &DepthMap, degrees: f64) -> Seen {
         let nominal = Camera::orbit_at_yaw_degrees(degrees, view.camera.width);
         let (to_side, from_side) = (nominal.world_to_camera, nominal.world_to_camera.inverse());
         let camera = turned(&view.camera, &self.turn);

@@ -6,7 +6,7 @@ use burn::data::dataloader::batcher::Batcher;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng;
 
-use super::place::Four;
+use super::four_views::FourViews;
 use super::{SampleConfig, Source, Stage};
 use crate::dataset::{Folder, Split};
 use snapsnap_base::FileError;
@@ -58,8 +58,8 @@ impl Stage1 {
     /// [`FileError`] if the split has no subject, the number of views is no multiple of 4, or the config contradicts
     /// itself or the data set.
     pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, FileError> {
-        // Only stage 2 has targets of high resolution.
-        let config = SampleConfig { high_resolution: false, ..config };
+        // Only stage 2 has targets of high resolution, and samples without points.
+        let config = SampleConfig { high_resolution: false, points: true, ..config };
         Ok(Self { source: Source::new(folder, split, config, 4)?, make: Stage1Item::new })
     }
 }
@@ -77,17 +77,15 @@ impl Stage1Item {
     }
 
     fn new(source: &Source, index: usize) -> Result<Self, FileError> {
-        let (subject, mut random) = source.subject(1, index);
-        let first = source.front(&mut random);
-        let order = source.order(first);
+        let (person, mut random) = source.person(1, index);
+        let front = source.front(&mut random);
         let side = source.folder.description().resolution as usize;
-        let is_placed = source.is_placed(&mut random);
-        let Four { photographs, points, valid, second, .. } =
-            source.four(subject, &order, is_placed, &mut random)?;
+        let views = source.four_views(person, source.order(front), &mut random)?;
+        let FourViews { photographs, first: (points, valid), second, .. } = views;
         let images = photographs.each_ref().map(|photo| &*photo.rgb).concat();
         let masks = photographs.each_ref().map(|photo| &*photo.mask).concat();
         let (second_points, second_valid) = second;
-        let name = format!("{}: {subject}, view {first}", source.folder.root().display());
+        let name = format!("{}: {}, view {front}", source.folder.root().display(), person.name);
         let mut item = Self { name, side, images, masks, points, valid, second_points, second_valid };
         if source.config.augment.flip && random.random() {
             item.flip();

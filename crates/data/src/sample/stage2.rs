@@ -7,9 +7,9 @@ use snapsnap_net::Photograph;
 use snapsnap_photo::Restoration;
 use snapsnap_splat::Camera;
 
-use super::place::Four;
-use super::{SampleConfig, Source, Stage, pair};
-use crate::dataset::{Folder, Layout, Split};
+use super::four_views::FourViews;
+use super::{SampleConfig, Source, Stage};
+use crate::dataset::{Folder, Split};
 use snapsnap_base::FileError;
 
 /// Samples of stage 2 (docs/method.md, "Samples"). The front is the first view with `compat`, else any view that the
@@ -52,12 +52,6 @@ impl Stage2 {
     /// # Errors
     /// As [`super::Stage1::new`].
     pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, FileError> {
-        let authors = folder.description().layout == Layout::Authors;
-        if authors && config.high_resolution && config.augment.background_color {
-            let message =
-                "has no masks at twice the side, which `background_color` needs with `high_resolution`";
-            return Err(FileError::unsuitable(folder.root(), message));
-        }
         // Only stage 1 has second surfaces.
         let config = SampleConfig { second_depth: false, ..config };
         Ok(Self { source: Source::new(folder, split, config, 4)?, make: Stage2Item::new })
@@ -66,50 +60,33 @@ impl Stage2 {
 
 impl Stage2Item {
     fn new(source: &Source, index: usize) -> Result<Self, FileError> {
-        let Source { folder, split, config, .. } = source;
-        let (subject, mut random) = source.subject(2, index);
+        let Source { folder, config, .. } = source;
+        let (person, mut random) = source.person(2, index);
         let description = folder.description();
         let count = description.views;
-        let first = if config.compat { 0 } else { source.front(&mut random) };
-        let order = source.order(first);
-        let [front, back, right, left] = order;
-        let camera = |view: usize| folder.camera(*split, subject, view).map(|stored| source.camera(&stored));
-        let mut cameras = [camera(front)?, camera(back)?, camera(right)?, camera(left)?];
+        let front = if config.compat { 0 } else { source.front(&mut random) };
+        let order = source.order(front);
         let random_views =
             (0..config.random_targets).map(|_| random.random_range(0..count)).collect::<Vec<_>>();
         let background =
-            if config.augment.background_color { [(); 3].map(|()| random.random()) } else { [0.0; 3] };
+            if config.augment.is_photographic { [(); 3].map(|()| random.random()) } else { [0.0; 3] };
         let target_side = description.resolution * if config.high_resolution { 2 } else { 1 };
         let (mut targets, mut target_masks, mut target_cameras) = (Vec::new(), Vec::new(), Vec::new());
-        for view in random_views.into_iter().chain([right, left]) {
-            let (target, mask) = source.target(subject, view, config.high_resolution, background)?;
+        for view in random_views.into_iter().chain([order[2], order[3]]) {
+            let (target, mask) = source.target(person, view, config.high_resolution, background)?;
             targets.extend(target);
             target_masks.extend(mask);
             // The camera at the size of the stored picture.
-            let stored = folder.camera(*split, subject, view)?.resized(target_side, target_side);
+            let stored = person.camera(view)?.resized(target_side, target_side);
             target_cameras.push(source.camera(&stored));
         }
-        let is_placed = source.is_placed(&mut random);
-        let four = if config.points {
-            source.four(subject, &order, is_placed, &mut random)?
-        } else {
-            let picture = |view: usize| folder.picture(*split, subject, view, false);
-            let pictures = [picture(front)?, picture(back)?];
-            let pictures = pictures.each_ref().map(|(color, mask)| (color, mask));
-            let photographs = source.photographs(subject, [front, back], pictures, is_placed, &mut random)?;
-            let mappings = [0, 1].map(|i| &photographs.frames[i].mapping);
-            let restoration = config.upright.then(|| {
-                Restoration::to_cameras([&cameras[0], &cameras[1]], mappings, description.resolution)
-            });
-            let (points, valid, second) = Default::default();
-            Four { photographs: pair(photographs.canvases), points, valid, second, restoration }
-        };
-        let Four { photographs, points, valid, restoration, .. } = four;
+        let views = source.four_views(person, order, &mut random)?;
+        let FourViews { photographs, mut cameras, first: (points, valid), restoration, .. } = views;
         if let Some(restoration) = &restoration {
             cameras[0] = restoration.front;
         }
         Ok(Self {
-            name: format!("{}: {subject}, view {first}", folder.root().display()),
+            name: format!("{}: {}, view {front}", folder.root().display(), person.name),
             side: description.resolution as usize,
             photographs,
             cameras,

@@ -5,8 +5,9 @@ use std::sync::Arc;
 use image::{GrayImage, RgbImage};
 use snapsnap_splat::Camera;
 
-use super::{Augment, Handling, SampleConfig, Source};
-use crate::dataset::{Folder, Split, unproject};
+use super::four_views::{Points, add};
+use super::{Augment, PhotographChanges, SampleConfig, Source};
+use crate::dataset::{DepthMap, Folder, Person, Split};
 use snapsnap_base::FileError;
 
 /// Subjects of a test set. The caller chooses the input views. The published test takes the first and the opposite one,
@@ -31,20 +32,15 @@ impl Test {
     /// The subjects of a split; `None` is the root itself, as in the authors' test sets.
     ///
     /// # Errors
-    /// [`FileError`] if the split has no subject, or the config contradicts itself.
-    pub fn new(folder: Arc<Folder>, split: Option<Split>, config: SampleConfig) -> Result<Self, FileError> {
-        let config = SampleConfig { repeat: 1, high_resolution: false, augment: Augment::none(), ..config };
+    /// [`FileError`] if the split has no subject.
+    pub fn new(folder: Arc<Folder>, split: Option<Split>) -> Result<Self, FileError> {
+        let config = SampleConfig { augment: Augment::none(), ..SampleConfig::default() };
         Source::new(folder, split, config, 1).map(Self)
     }
 
     /// Number of subjects.
-    pub fn len(&self) -> usize {
-        self.0.len()
-    }
-
-    /// Whether the set is empty. It never is.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
+    pub fn count(&self) -> usize {
+        self.0.subjects.len()
     }
 
     /// Name of a subject.
@@ -52,23 +48,31 @@ impl Test {
         &self.0.subjects[index]
     }
 
-    /// One subject with the photographs of some of its views, changed by `handling`.
+    fn person(&self, index: usize) -> Person<'_> {
+        self.0.folder.person(self.0.split, self.name(index))
+    }
+
+    /// One subject with the photographs of some of its views, changed by `changes`.
     ///
     /// # Errors
     /// [`FileError`] for files that are missing or damaged.
-    pub fn sample(&self, index: usize, views: &[usize], handling: &Handling) -> Result<TestItem, FileError> {
-        let source = &self.0;
-        let subject = self.name(index);
-        let description = source.folder.description();
+    pub fn sample(
+        &self,
+        index: usize,
+        views: &[usize],
+        changes: &PhotographChanges,
+    ) -> Result<TestItem, FileError> {
+        let person = self.person(index);
+        let description = self.0.folder.description();
         let photograph = |(place, view): (usize, &usize)| {
-            let (color, mask) = source.folder.picture(source.split, subject, *view, false)?;
-            Ok(handling.apply(place, color, mask))
+            let (color, mask) = person.picture(*view, false)?;
+            Ok(changes.apply(place, color, mask))
         };
         let photographs = views.iter().enumerate().map(photograph).collect::<Result<Vec<_>, FileError>>()?;
-        let camera = |view: usize| source.folder.camera(source.split, subject, view);
-        let cameras = (0..description.views).map(|view| camera(view).map(|stored| source.camera(&stored)));
+        let camera = |view: usize| person.camera(view).map(|stored| self.0.camera(&stored));
+        let cameras = (0..description.views).map(camera);
         Ok(TestItem {
-            subject: subject.to_owned(),
+            subject: person.name.to_owned(),
             side: description.resolution as usize,
             photographs,
             cameras: cameras.collect::<Result<_, _>>()?,
@@ -86,7 +90,7 @@ impl Test {
         view: usize,
         background: [f32; 3],
     ) -> Result<(Vec<f32>, Vec<f32>), FileError> {
-        self.0.target(self.name(index), view, false, background)
+        self.0.target(self.person(index), view, false, background)
     }
 
     /// Points of some views of a subject, `[V,H,W,3]` in metres in the first view's frame, and their validity
@@ -95,15 +99,12 @@ impl Test {
     /// # Errors
     /// As [`Self::sample`].
     pub fn points(&self, index: usize, views: &[usize]) -> Result<(Vec<f32>, Vec<f32>), FileError> {
-        let source = &self.0;
-        let (mut points, mut valid, mut front) = (Vec::new(), Vec::new(), None);
+        let (mut points, mut front) = (Points::default(), None);
         for view in views {
-            let stored = source.folder.depth(source.split, self.name(index), *view)?;
-            let camera = source.camera(&stored.camera);
-            let front = front.get_or_insert(camera.world_to_camera);
-            points.extend(unproject(&stored.depth, &camera, front, 0.0));
-            valid.extend(stored.depth.iter().map(|z| f32::from(u8::from(*z > 0.0))));
+            let stored = self.person(index).depth(*view)?;
+            let map = DepthMap { camera: self.0.camera(&stored.camera), ..stored };
+            add(&mut points, map.points(front.get_or_insert(map.camera.world_to_camera)));
         }
-        Ok((points, valid))
+        Ok(points)
     }
 }

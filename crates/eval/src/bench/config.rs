@@ -84,12 +84,10 @@ impl BenchConfig {
 
     /// The config of the evaluation of a variant's pictures.
     pub(super) fn evaluation(&self, variant: &Variant) -> EvalConfig {
-        // Only one person's Gaussians are fitted.
-        let subjects = if variant.tune.is_some() { 1 } else { self.bench.people };
         let only = variant.only.as_ref().unwrap_or(&self.data.only).clone();
         let (views, metrics) = (ViewsSection::default(), MetricsSection::default());
         EvalConfig {
-            data: DataSection { subjects, only, ..self.data.clone() },
+            data: DataSection { subjects: self.bench.people, only, ..self.data.clone() },
             views: ViewsSection {
                 inputs: variant.inputs.clone().unwrap_or_default(),
                 resolution: self.bench.resolution,

@@ -3,7 +3,6 @@
 pub mod config;
 mod oracle;
 pub mod report;
-mod tune;
 
 use std::time::{Duration, Instant};
 
@@ -41,8 +40,6 @@ pub struct Measured {
     pub omits: Option<String>,
     /// The steps that ran, and the omitted ones with reasons.
     pub plan: Vec<String>,
-    /// Seconds of a step that fits the Gaussians to the photographs, p50.
-    pub tuning: Option<f64>,
     /// Name of the device.
     pub device: String,
     /// Number of timed reconstructions.
@@ -98,11 +95,6 @@ impl Measured {
     pub fn time(&self) -> f64 {
         self.p50 + self.render
     }
-
-    /// Whether the variant belongs to no scene and its Gaussians are not fitted.
-    fn is_plain(&self) -> bool {
-        self.scene.is_none() && self.tuning.is_none()
-    }
 }
 
 /// Measures one variant in this process. `most_used` returns the largest memory of the process so far, in bytes.
@@ -120,13 +112,13 @@ pub fn measure(
     let runs = config.bench.runs;
     let mut eval = config.evaluation(variant);
     let folder = variant.data.as_ref().or(config.data.folders.first());
-    let folder = folder.ok_or_else(|| EvalError::Empty("there is no data set".into()))?;
+    let folder = folder.ok_or_else(|| EvalError::Message("there is no data set".into()))?;
     let people = People::open(folder, &eval.data, &eval.views)?;
     let (all, compared) = (people.views(), config.bench.views.min(people.views()));
     eval.views.compared = (0..compared).map(|i| (2 * i + 1) * all / (2 * compared)).collect();
     let nobody = || match eval.data.only.as_slice() {
-        [] => EvalError::Empty(format!("{}: has no people", folder.display())),
-        only => EvalError::Empty(format!("{}: has no person named {}", folder.display(), only.join(", "))),
+        [] => EvalError::Message(format!("{}: has no people", folder.display())),
+        only => EvalError::Message(format!("{}: has no person named {}", folder.display(), only.join(", "))),
     };
     let first = people.chosen().first().copied().ok_or_else(nobody)?;
 
@@ -147,7 +139,7 @@ pub fn measure(
         model.reconstruct(&item, &inputs)?;
     }
     let mut reconstructions = Vec::new();
-    let (mut made, _) = timed(runs, || {
+    let (made, _) = timed(runs, || {
         let mut made = model.reconstruct(&item, &inputs)?;
         reconstructions.push((made.time, std::mem::take(&mut made.modules)));
         Ok(made)
@@ -159,13 +151,6 @@ pub fn measure(
         let of_all = reconstructions.iter().flat_map(|(_, modules)| modules);
         let times: Vec<Duration> = of_all.filter(|(name, _)| name == module).map(|(_, time)| *time).collect();
         modules.push(((*module).to_owned(), quantile_of_times(&times, 0.5)));
-    }
-    let mut tuning = None;
-    if let Some(tuned) = variant.tune {
-        let steps = tune::STEPS.min(20 * runs);
-        let (gaussians, times) = tune::fit(&made.gaussians, &people, (first, &inputs, &item), tuned, steps)?;
-        made.gaussians = gaussians;
-        tuning = Some(quantile_of_times(&times, 0.5));
     }
     let memory = most_used();
 
@@ -182,15 +167,12 @@ pub fn measure(
 
     let gaussians = made.gaussians.len();
     let plan = made.steps.iter().map(ToString::to_string).collect();
-    let contestant = match variant.tune {
-        Some(_) => Contestant::fixed(name, made.gaussians),
-        None => Contestant::model(name, Kind::Model, model),
-    };
+    let contestant = Contestant::model(name, Kind::Model, model);
     let outcome = evaluate(&eval, std::slice::from_ref(&people), &[contestant], lpips, &|_, _| ());
     let judged = &outcome.judged[0];
     let scores: Vec<Score> = judged.rows.iter().map(|row| row.scores[0]).collect();
     let Score { psnr, ssim, lpips } =
-        Score::mean(&scores).ok_or_else(|| EvalError::Empty("no view could be compared".into()))?;
+        Score::mean(&scores).ok_or_else(|| EvalError::Message("no view could be compared".into()))?;
     let points = |sides: bool| {
         let errors = judged.points.iter().flat_map(|(_, errors)| errors);
         let errors = errors.filter(|error| (error.view > 1) == sides);
@@ -204,7 +186,6 @@ pub fn measure(
         scene: variant.scene.clone(),
         omits: variant.omits.clone(),
         plan,
-        tuning,
         device: device_name.into(),
         runs,
         p50: quantile_of_times(&times, 0.5),
@@ -253,10 +234,11 @@ const FASTER: f64 = 0.03;
 
 /// For each variant, the index of the best variant that dominates it: with better pictures (the paired interval over
 /// people is above 0) in at most 3 % more time, or with equally good pictures in at least 3 % less time. The time is
-/// the sum of a reconstruction and a view. Scenes, tuned Gaussians and different people are not compared.
+/// the sum of a reconstruction and a view. Scenes and different people are not compared.
 pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
     let names = |m: &Measured| m.people.iter().map(|person| person.name.clone()).collect::<Vec<_>>();
-    let is_alike = |a: &Measured, b: &Measured| a.is_plain() && b.is_plain() && names(a) == names(b);
+    let is_alike =
+        |a: &Measured, b: &Measured| a.scene.is_none() && b.scene.is_none() && names(a) == names(b);
     let beats = |a: &Measured, b: &Measured| {
         let pairs = a.people.iter().zip(&b.people);
         let differences: Vec<f64> = pairs.map(|(a, b)| difference(a.psnr, b.psnr)).collect();
@@ -297,9 +279,9 @@ mod tests {
         all[4].render = 20.0;
         assert_eq!(dominated(&all), [None, Some(0), None, None, None]);
         all[4].render = 1.0;
-        // Scenes, fitted Gaussians and different people are not compared.
-        let others: [fn(&mut Measured); 3] =
-            [|m| m.scene = Some("another".into()), |m| m.tuning = Some(1.0), |m| m.people[1].name.push('c')];
+        // Scenes and different people are not compared.
+        let others: [fn(&mut Measured); 2] =
+            [|m| m.scene = Some("another".into()), |m| m.people[1].name.push('c')];
         for other in others {
             let mut all = all.clone();
             [0, 4].into_iter().for_each(|place| other(&mut all[place]));

@@ -145,8 +145,6 @@ impl Bench<'_> {
         for scene in scenes {
             let of_scene = || self.measured.iter().filter(|m| m.scene.as_ref() == Some(scene));
             let Some(whole) = of_scene().find(|m| m.omits.is_none()) else { continue };
-            // The time of a fit is the time of one step.
-            let time = |m: &Measured| 1e3 * m.tuning.unwrap_or(m.p50);
             let share = |now: f64, before: f64| format!("{:.0} %", 100.0 * (1.0 - now / before));
             let megabytes = |m: &Measured| m.memory.map(|bytes| bytes as f64 / 1e6);
             let row = |m: &Measured| {
@@ -155,8 +153,8 @@ impl Bench<'_> {
                 let points = m.points_mm.zip(whole.points_mm);
                 vec![
                     m.omits.clone().unwrap_or("nothing".into()),
-                    format!("{:.1}", time(m)),
-                    or_nothing(share(time(m), time(whole))),
+                    format!("{:.1}", 1e3 * m.p50),
+                    or_nothing(share(m.p50, whole.p50)),
                     memory.map_or("n/a".into(), |(now, _)| format!("{now:.0}")),
                     or_nothing(memory.map_or("n/a".into(), |(now, before)| share(now, before))),
                     format!("{:.2}", m.psnr),
@@ -166,10 +164,9 @@ impl Bench<'_> {
                     m.gaussians.to_string(),
                 ]
             };
-            let milliseconds = if whole.tuning.is_some() { "a step of fitting, ms" } else { "time, ms" };
             let header = [
                 "left out",
-                milliseconds,
+                "time, ms",
                 "saved",
                 "memory, MB",
                 "saved",
@@ -223,7 +220,6 @@ impl Bench<'_> {
             ("p50_s", |m| m.p50.to_string()),
             ("p95_s", |m| m.p95.to_string()),
             ("render_s", |m| m.render.to_string()),
-            ("tuning_step_s", |m| number(m.tuning)),
             ("memory_bytes", |m| m.memory.map_or(String::new(), |bytes| bytes.to_string())),
             ("gaussians", |m| m.gaussians.to_string()),
             ("splat_error", |m| m.splat_error.to_string()),
@@ -247,7 +243,7 @@ impl Bench<'_> {
     fn pareto(&self) -> String {
         let at = |m: &Measured| (1e3 * m.time(), m.psnr);
         let by = dominated(self.measured);
-        let plain = || self.measured.iter().zip(&by).filter(|(m, _)| m.is_plain());
+        let plain = || self.measured.iter().zip(&by).filter(|(m, _)| m.scene.is_none());
         if plain().count() < 2 {
             return String::new();
         }

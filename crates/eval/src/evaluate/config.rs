@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::Split;
-use snapsnap_data::sample::Handling;
+use snapsnap_data::sample::PhotographChanges;
 use snapsnap_splat::{Preset, RenderOptions};
 
 use crate::geometry::Align;
@@ -21,7 +21,7 @@ pub struct EvalConfig {
     /// Input views and compared views.
     pub views: ViewsSection,
     /// Changes to the photographs for models. Baselines get unchanged photographs.
-    pub photographs: Handling,
+    pub photographs: PhotographChanges,
     /// The model under test.
     pub model: ModelSection,
     /// Metrics.

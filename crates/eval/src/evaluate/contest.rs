@@ -3,21 +3,19 @@
 use std::time::Duration;
 
 use burn::tensor::Device;
-use snapsnap_data::sample::{Handling, TestItem};
+use snapsnap_data::sample::{PhotographChanges, TestItem};
 use snapsnap_net::Photograph;
-use snapsnap_ops::host;
 use snapsnap_splat::{Camera, Gaussians};
 
+use super::baselines::{MeanPictures, billboard, true_points};
 use super::config::{MetricsSection, ViewsSection};
-use super::meshes::ALIGNED;
 use super::model::{Made, Model, no_gaussian};
 use super::person::{People, Points, nearest_view, photograph, points};
-use super::rendered;
+use super::shared::rendered;
 use super::sides::side_points;
-use super::surface::{Truth, thinned};
+use super::surface::Truth;
 use crate::EvalError;
-use crate::baselines::{MeanPictures, billboard, true_points};
-use crate::geometry::{Align, double, icp};
+use crate::geometry::{ALIGNED, Align, double, icp, opaque_centres, thinned};
 use crate::pictures::Picture;
 use crate::points::{Pair, PointError, point_errors};
 
@@ -48,7 +46,6 @@ enum Means {
     Billboard(Device),
     TruePoints(Device),
     Mean(MeanPictures),
-    Fixed(Box<Gaussians>),
 }
 
 /// A contestant's result for a person.
@@ -86,11 +83,6 @@ impl Contestant {
         Self { name: "mean_picture".into(), means: Means::Mean(pictures) }
     }
 
-    /// The same Gaussians (world frame) for every person.
-    pub fn fixed(name: &str, gaussians: Gaussians) -> Self {
-        Self { name: name.into(), means: Means::Fixed(Box::new(gaussians)) }
-    }
-
     /// The role in the report.
     pub fn kind(&self) -> Kind {
         match &self.means {
@@ -119,7 +111,7 @@ impl Contestant {
         };
         match &self.means {
             Means::Model(_, model) => {
-                let is_changed = model.photographs != Handling::default();
+                let is_changed = model.photographs != PhotographChanges::default();
                 let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
                 let item = own.as_ref().unwrap_or(item);
                 let mut made = model.reconstruct(item, inputs)?;
@@ -150,7 +142,7 @@ impl Contestant {
                 }
                 let Some((points, there)) = points(people.test(), row, &views, item.side, canvas)? else {
                     let message = format!("views of {}² give no points on a canvas of {canvas}²", item.side);
-                    return Err(EvalError::Empty(message));
+                    return Err(EvalError::Message(message));
                 };
                 let (photographs, mut valid) = on_canvas(item, inputs.len(), canvas);
                 valid.resize(views.len(), vec![true; canvas * canvas]);
@@ -160,7 +152,6 @@ impl Contestant {
                 let front = &item.cameras[inputs[0]];
                 plain(true_points(&photographs, &points, &valid, canvas, front, device))
             }
-            Means::Fixed(gaussians) => plain(gaussians.as_ref().clone()),
             Means::Mean(_) => Ok(of(None)),
         }
     }
@@ -180,7 +171,7 @@ impl Contestant {
         match (&shown.gaussians, &self.means) {
             (Some(gaussians), _) => rendered(gaussians, camera, side, views),
             (None, Means::Mean(pictures)) => pictures.picture(view, side),
-            (None, _) => Err(EvalError::Empty("there is nothing to render".into())),
+            (None, _) => Err(EvalError::Message("there is nothing to render".into())),
         }
     }
 }
@@ -193,20 +184,9 @@ fn aligned(
     truth: Option<&Truth>,
     front: &Camera,
 ) -> Result<[f64; 3], EvalError> {
-    let (align, opaque) = (metrics.align, metrics.opaque);
-    let truth = truth.ok_or_else(|| EvalError::Empty("there is no ground truth to align with".into()))?;
-    let opacities = host(made.gaussians.opacities.clone());
-    let means = host(made.gaussians.means.clone());
-    let centres = means.as_chunks().0.iter().zip(opacities);
-    let centres: Vec<[f32; 3]> = centres.filter(|(_, own)| *own >= opaque).map(|(p, _)| *p).collect();
-    if centres.is_empty() {
-        let message = format!(
-            "no Gaussian has an opacity of {opaque} or more (`metrics.opaque`): there is nothing to align"
-        );
-        return Err(EvalError::Empty(message));
-    }
-    let centres = thinned(&centres, ALIGNED);
-    let motion = icp(&centres, &thinned(&truth.points, 10 * ALIGNED), align == Align::Similarity)?;
+    let truth = truth.ok_or_else(|| EvalError::Message("there is no ground truth to align with".into()))?;
+    let centres = opaque_centres(&made.gaussians, metrics.opaque, ALIGNED)?;
+    let motion = icp(&centres, &thinned(&truth.points, 10 * ALIGNED), metrics.align == Align::Similarity)?;
     made.gaussians = made.gaussians.clone().scaled(motion.scale).transformed(&motion.rigid());
     let (to_world, to_front) = (front.world_to_camera.inverse(), front.world_to_camera);
     for (_, points) in &mut made.maps {
@@ -266,6 +246,7 @@ mod tests {
     use glam::{DQuat, DVec3};
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
+    use snapsnap_ops::host;
 
     use super::*;
 

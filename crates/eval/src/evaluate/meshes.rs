@@ -12,15 +12,13 @@ use snapsnap_mesh::mesh::Mesh;
 
 use super::config::EvalConfig;
 use super::person::People;
-use super::surface::{thinned, truth as truth_of};
-use super::{LeftOut, missing, name_of};
+use super::shared::{LeftOut, missing, name_of};
+use super::surface::truth as truth_of;
 use crate::EvalError;
-use crate::geometry::{Align, chamfer, icp, point_to_surface, sampled};
+use crate::geometry::{ALIGNED, Align, chamfer, icp, point_to_surface, sampled, thinned};
 
 /// Points drawn from each surface.
 const POINTS: usize = 50_000;
-/// Points drawn for an alignment.
-pub(super) const ALIGNED: usize = 5_000;
 /// Seeds of the points of a mesh and of the scan. With one seed, equal meshes would get equal points.
 const SEEDS: [u64; 2] = [1, 2];
 

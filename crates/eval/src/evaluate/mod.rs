@@ -1,21 +1,22 @@
 //! Evaluation of a model and its baselines on the people of a data set (docs/method.md, "Evaluation").
 
+pub mod baselines;
 pub mod config;
 mod contest;
 pub mod meshes;
 pub mod model;
 pub mod person;
+mod shared;
 mod sides;
 mod surface;
 
 use std::collections::BTreeMap;
-use std::path::Component;
 use std::time::Duration;
 
 use image::RgbImage;
 use rayon::prelude::*;
-use snapsnap_data::sample::{Handling, TestItem};
-use snapsnap_splat::{Camera, Gaussians, render};
+use snapsnap_data::sample::{PhotographChanges, TestItem};
+use snapsnap_splat::Gaussians;
 
 use crate::EvalError;
 use crate::geometry::Align;
@@ -26,10 +27,12 @@ use crate::preview::{color, grid, heat};
 use crate::region::{Region, margin};
 use crate::score::Score;
 
-use config::{EvalConfig, Protocol, ViewsSection};
+use config::{EvalConfig, Protocol};
 use contest::Shown;
 pub use contest::{Contestant, Kind};
 use person::People;
+pub use shared::{LeftOut, rendered};
+use shared::{at_once, missing, name_of};
 pub use surface::{Surface, Truth, truth};
 
 /// Scores of one view of a person.
@@ -80,22 +83,6 @@ pub(crate) fn by_person<'a>(
         scores.entry(row.person).or_default().push(row.scores[protocol]);
     }
     scores.into_iter().filter_map(|(person, scores)| Some((person, Score::mean(&scores)?))).collect()
-}
-
-/// A part of an evaluation that failed.
-#[derive(Debug, Clone, serde::Serialize)]
-pub struct LeftOut {
-    /// Person, or person and view, or model.
-    pub name: String,
-    /// The reason.
-    pub why: String,
-}
-
-impl LeftOut {
-    /// A failed part and the reason.
-    pub fn new(name: impl Into<String>, why: impl ToString) -> Self {
-        Self { name: name.into(), why: why.to_string() }
-    }
 }
 
 /// The result of an evaluation.
@@ -157,43 +144,9 @@ pub fn evaluate(
     outcome
 }
 
-/// The people whom the config names and no data set has.
-pub(crate) fn missing(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
-    let is_missing = |name: &&String| {
-        !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name.as_str()))
-    };
-    let missing = config.data.only.iter().filter(is_missing);
-    let why = "data.only: no data set has this person, or not among its first `data.subjects`";
-    let mut left_out: Vec<LeftOut> = missing.map(|name| LeftOut::new(name, why)).collect();
-    if left_out.is_empty() && sets.iter().all(|set| set.chosen().is_empty()) {
-        left_out.push(LeftOut::new("everything", "the data sets have no people"));
-    }
-    left_out
-}
-
 /// Whether a person has this name, with or without the data set's name before it.
 pub(crate) fn is_named(person: &str, name: &str) -> bool {
     person == name || person.rsplit('/').next() == Some(name)
-}
-
-/// A person's name. With several data sets, the data set's name stands before it.
-fn name_of(sets: &[People], people: &People, row: usize) -> String {
-    let name = people.test().name(row);
-    if sets.len() < 2 {
-        return name.to_owned();
-    }
-    let parts = |set: &People| {
-        let root = set.folder().root();
-        let root = root.canonicalize().unwrap_or_else(|_| root.to_owned());
-        let parts = root.components().filter(|part| matches!(part, Component::Normal(_)));
-        parts.map(|part| part.as_os_str().to_string_lossy().into_owned()).collect::<Vec<_>>()
-    };
-    // The fewest last folders of the path that no other data set has.
-    let (own, all) = (parts(people), sets.iter().map(parts).collect::<Vec<_>>());
-    let called = |count: usize| &own[own.len() - count..];
-    let is_own = |count: &usize| all.iter().filter(|other| other.ends_with(called(*count))).count() == 1;
-    let count = (1..own.len()).find(is_own).unwrap_or(own.len());
-    format!("{}/{name}", called(count).join("/"))
 }
 
 /// A person and the contestants.
@@ -227,7 +180,7 @@ impl Place<'_> {
     fn evaluate(&self, turn: usize, truth: Option<&Truth>, outcome: &mut Outcome) {
         let Self { config, contestants, people, row, person, .. } = *self;
         let (inputs, side) = (people.inputs(&config.views, turn), people.side(&config.views));
-        let item = people.item(row, &inputs, &Handling::default());
+        let item = people.item(row, &inputs, &PhotographChanges::default());
         let Some(item) = self.kept(outcome, "", item) else { return };
         let mut shown = Vec::new();
         for (i, contestant) in contestants.iter().enumerate() {
@@ -320,29 +273,6 @@ impl Place<'_> {
     }
 }
 
-/// Number of pictures of `side`² pixels that are processed at once, to bound memory: 64 million pixels need about 3
-/// GB.
-pub(crate) fn at_once(side: usize) -> usize {
-    const PIXELS: usize = 1 << 26;
-    (PIXELS / (side * side).max(1)).clamp(1, rayon::current_num_threads())
-}
-
-/// A render of Gaussians (world frame) over black, `side`² pixels, with the config's options.
-///
-/// # Errors
-/// [`EvalError`] for Gaussians that cannot be rendered.
-pub fn rendered(
-    gaussians: &Gaussians,
-    camera: &Camera,
-    side: usize,
-    views: &ViewsSection,
-) -> Result<Picture, EvalError> {
-    let large = side * views.supersampling;
-    let camera = camera.resized(large as u32, large as u32);
-    let color = render(gaussians, std::slice::from_ref(&camera), &views.render_options())?.color;
-    Picture::rendered(&snapsnap_ops::host(color), [large, large], views.supersampling)
-}
-
 /// Mean absolute difference of the channels that the sheet shows as white.
 const WORST: f32 = 0.5;
 
@@ -381,7 +311,7 @@ fn pictures(
     contestant: &Contestant,
 ) -> Result<Vec<RgbImage>, EvalError> {
     let inputs = people.inputs(&config.views, config.views.turns[0]);
-    let item = people.item(row, &inputs, &Handling::default())?;
+    let item = people.item(row, &inputs, &PhotographChanges::default())?;
     let side = people.side(&config.views);
     let truth = (config.metrics.align != Align::None).then(|| truth(people, row)).transpose()?;
     let shown = contestant.prepare(people, row, &item, &inputs, side, (&config.metrics, truth.as_ref()))?;

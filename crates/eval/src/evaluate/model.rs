@@ -4,15 +4,15 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use burn::tensor::{Device, Tensor};
-use snapsnap_data::sample::{Handling, Road, TestItem};
-use snapsnap_net::config::{OPPOSITE, PrecisionChoice, RotationFrame, WorldFrame};
-use snapsnap_net::gaussians::Origin;
+use snapsnap_data::sample::{PhotographChanges, Road, TestItem};
+use snapsnap_net::config::{OPPOSITE, Precision, RotationFrame, WorldFrame};
 use snapsnap_net::network::View;
+use snapsnap_net::painter::Origin;
 use snapsnap_net::steps::Step;
 use snapsnap_net::weights::{WeightFile, WeightsError};
 use snapsnap_net::{Photograph, Reconstructor, placed};
+use snapsnap_ops::gather::taken;
 use snapsnap_ops::host;
-use snapsnap_ops::rows::taken;
 use snapsnap_photo::{Cutting, Frame, Person, Photographs, Restoration, Source as Picture, Told};
 use snapsnap_splat::Gaussians;
 
@@ -27,7 +27,7 @@ pub struct Model {
     stride: usize,
     min_opacity: f32,
     /// Changes to the photographs that the model gets.
-    pub photographs: Handling,
+    pub photographs: PhotographChanges,
 }
 
 /// The reconstruction of a person.
@@ -53,8 +53,8 @@ impl Model {
     /// # Errors
     /// [`WeightsError`] if a part is absent or a value is not finite.
     pub fn load(weights: &WeightFile, device: &Device, variant: &Variant) -> Result<Self, WeightsError> {
-        let precision =
-            variant.precision.unwrap_or(PrecisionChoice::Auto).of_weights(&weights.config, device);
+        let own = || Precision::of_weights(&weights.config, device);
+        let precision = variant.precision.unwrap_or_else(own);
         let mut reconstructor = Reconstructor::load(weights, device)?.in_precision(precision);
         // Scenes of more than two photographs have no unseen sides.
         let is_pair = variant.inputs.as_ref().is_none_or(|inputs| inputs.len() <= 2);
@@ -83,7 +83,7 @@ impl Model {
         const MOST: f64 = 0.5;
         let expected = self.reconstructor.config().network.pair_degrees;
         if expected != OPPOSITE && (found - expected).abs() > MOST {
-            return Err(EvalError::Empty(format!(
+            return Err(EvalError::Message(format!(
                 "`views.inputs` are {found:.1}° apart, but `network.pair_degrees` of the weights is {expected}"
             )));
         }
@@ -126,19 +126,19 @@ impl Model {
     fn of_user(&self, item: &TestItem, inputs: &[usize]) -> Result<Made, EvalError> {
         let &[front, back] = inputs else {
             let message = "`photographs.road = \"user\"` is for a front and a back: `views.inputs`";
-            return Err(EvalError::Empty(message.into()));
+            return Err(EvalError::Message(message.into()));
         };
         let config = self.reconstructor.config();
         if config.world_frame() == WorldFrame::Mirrored || config.rotation_frame() == RotationFrame::World {
             let message =
                 "`photographs.road = \"user\"` is for networks whose people are upright: `mode.compat`";
-            return Err(EvalError::Empty(message.into()));
+            return Err(EvalError::Message(message.into()));
         }
         self.check_pair(degrees(&item.cameras[back], &item.cameras[front]))?;
         let photographs = self.canvases(item, Cutting::All)?;
         let start = Instant::now();
         let person = snapsnap_photo::person(&photographs, &self.reconstructor, &Told::default(), &|_| ());
-        let Person { gaussians, made, .. } = person.map_err(|none| EvalError::Empty(none.to_string()))?;
+        let Person { gaussians, made, .. } = person.map_err(|none| EvalError::Message(none.to_string()))?;
         let time = start.elapsed();
         let cameras = [&item.cameras[front], &item.cameras[back]];
         let mappings = [0, 1].map(|i| &photographs.frames[i].mapping);
@@ -259,7 +259,7 @@ impl Model {
 }
 
 pub(super) fn no_gaussian() -> EvalError {
-    EvalError::Empty("no Gaussian came out".into())
+    EvalError::Message("no Gaussian came out".into())
 }
 
 /// Concatenates several sets of Gaussians.

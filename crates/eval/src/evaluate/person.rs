@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use glam::DVec3;
 use snapsnap_base::FileError;
 use snapsnap_data::dataset::{Arrangement, Folder, Split};
-use snapsnap_data::sample::{Handling, SampleConfig, Test, TestItem};
+use snapsnap_data::sample::{PhotographChanges, Test, TestItem};
 use snapsnap_net::Photograph;
 use snapsnap_net::config::Downsample;
 use snapsnap_net::resample::shrink;
@@ -60,7 +60,7 @@ impl People {
         let is_chosen =
             |i: &usize| data.only.is_empty() || data.only.iter().any(|name| name == test.name(*i));
         let most = if data.subjects == 0 { usize::MAX } else { data.subjects };
-        let chosen = (0..test.len()).filter(is_chosen).take(most).collect();
+        let chosen = (0..test.count()).filter(is_chosen).take(most).collect();
         Ok(Self { test, folder, chosen })
     }
 
@@ -96,12 +96,17 @@ impl People {
         if views.resolution > 0 { views.resolution } else { self.folder.description().resolution as usize }
     }
 
-    /// A person's photographs, with the changes of `handling`, masks and cameras.
+    /// A person's photographs, with `changes`, masks and cameras.
     ///
     /// # Errors
     /// [`EvalError::File`], also for a camera that mirrors: no quaternion can express the mirrored Gaussians.
-    pub fn item(&self, row: usize, inputs: &[usize], handling: &Handling) -> Result<TestItem, EvalError> {
-        let item = self.test.sample(row, inputs, handling)?;
+    pub fn item(
+        &self,
+        row: usize,
+        inputs: &[usize],
+        changes: &PhotographChanges,
+    ) -> Result<TestItem, EvalError> {
+        let item = self.test.sample(row, inputs, changes)?;
         let mirrors = |camera: &Camera| camera.world_to_camera.rotation.determinant() < 0.0;
         match item.cameras.iter().position(mirrors) {
             None => Ok(item),
@@ -135,7 +140,7 @@ pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalE
         let message = format!("has no split `{split}`: change `data.split`");
         return Err(EvalError::File(FileError::unsuitable(folder.root(), message)));
     }
-    Ok(Test::new(folder.clone(), split, SampleConfig::default())?)
+    Ok(Test::new(folder.clone(), split)?)
 }
 
 /// The largest divisor of a side up to `most`.

@@ -2,17 +2,17 @@
 
 use glam::DVec3;
 use rayon::prelude::*;
-use snapsnap_data::sample::Handling;
+use snapsnap_data::sample::PhotographChanges;
 use snapsnap_mesh::fuse::{Options, fuse};
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Renderer, ViewOptions};
 use snapsnap_net::dilated;
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
-use super::at_once;
 use super::person::{People, means, nearest_view, part_of};
+use super::shared::at_once;
 use crate::EvalError;
-use crate::geometry::{Chamfer, chamfer, consistency, double, normals, points, sampled};
+use crate::geometry::{Chamfer, chamfer, consistency, double, normals, opaque_centres, sampled, thinned};
 
 /// Largest number of ground-truth points per view.
 const PER_VIEW: usize = 4000;
@@ -66,7 +66,7 @@ pub struct Truth {
 /// # Errors
 /// [`EvalError`] for files that cannot be read, or if no view has a point.
 pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
-    let cameras = people.test().sample(row, &[], &Handling::default())?.cameras;
+    let cameras = people.test().sample(row, &[], &PhotographChanges::default())?.cameras;
     let directions = DIRECTIONS.map(|wanted| nearest_view(&cameras, 0, wanted));
     let of_view = |(view, camera): (usize, &Camera)| {
         let (points, valid) = people.test().points(row, &[view])?;
@@ -95,7 +95,7 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
     let (points, views): (Vec<_>, Vec<_>) = found.into_iter().unzip();
     let truth = Truth { points: points.concat(), views: views.into_iter().flatten().collect() };
     if truth.points.is_empty() {
-        return Err(EvalError::Empty("no view has a depth: there is no ground truth".into()));
+        return Err(EvalError::Message("no view has a depth: there is no ground truth".into()));
     }
     Ok(truth)
 }
@@ -117,9 +117,9 @@ impl Truth {
     /// [`Self::agreement`] for the depth maps of a mesh (world frame, metres).
     ///
     /// # Errors
-    /// [`EvalError::Empty`] for a mesh that cannot be drawn.
+    /// [`EvalError::Message`] for a mesh that cannot be drawn.
     pub fn agreement_of_mesh(&self, mesh: &Mesh) -> Result<Option<f64>, EvalError> {
-        let renderer = Renderer::new(mesh).map_err(|e| EvalError::Empty(e.to_string()))?;
+        let renderer = Renderer::new(mesh).map_err(|e| EvalError::Message(e.to_string()))?;
         let options = ViewOptions { samples: 1, ..ViewOptions::default() };
         Ok(self.agreement(|i| renderer.draw(&self.views[i].camera, &options).depth))
     }
@@ -146,12 +146,6 @@ impl Truth {
     }
 }
 
-/// At most `most` entries of a list, at equal steps.
-pub(super) fn thinned<T: Copy>(all: &[T], most: usize) -> Vec<T> {
-    let kept = all.len().min(most);
-    (0..kept).map(|i| all[i * all.len() / kept]).collect()
-}
-
 impl Surface {
     /// Compares Gaussians (world frame) with the truth: the centres of Gaussians with an opacity of at least `opaque`,
     /// and the rendered depths.
@@ -159,11 +153,7 @@ impl Surface {
     /// # Errors
     /// [`EvalError`] if no Gaussian is so opaque.
     pub fn of_gaussians(gaussians: &Gaussians, truth: &Truth, opaque: f32) -> Result<Self, EvalError> {
-        let opacities = snapsnap_ops::host(gaussians.opacities.clone());
-        let centres = points(&gaussians.means)?;
-        let there: Vec<[f32; 3]> =
-            centres.into_iter().zip(opacities).filter(|(_, o)| *o >= opaque).map(|(p, _)| p).collect();
-        let there = thinned(&there, MOST);
+        let centres = opaque_centres(gaussians, opaque, MOST)?;
         let options = RenderOptions { depth: true, ..RenderOptions::inria() };
         let drawn = |view: &TrueView| {
             let rendered = render(gaussians, std::slice::from_ref(&view.camera), &options)?;
@@ -175,7 +165,7 @@ impl Surface {
             depth.iter().zip(alpha).map(|(z, a)| if *a > 0.5 { z / a } else { 0.0 }).collect()
         };
         Ok(Self {
-            chamfer: chamfer(&there, &truth.points)?,
+            chamfer: chamfer(&centres, &truth.points)?,
             normals: truth.agreement(|i| surface(&drawn[i])),
             open: truth.open(&drawn),
         })
@@ -187,7 +177,7 @@ impl Surface {
     /// [`EvalError`] if no mesh can be made of the Gaussians.
     pub fn of_mesh(gaussians: &Gaussians, truth: &Truth) -> Result<Self, EvalError> {
         let fused = fuse(&gaussians.clone().into(), Options::default(), &|_| {});
-        let mesh = fused.map_err(|e| EvalError::Empty(e.to_string()))?.into_world();
+        let mesh = fused.map_err(|e| EvalError::Message(e.to_string()))?.mesh;
         let drawn = sampled(&mesh, MOST, SEED)?;
         Ok(Self {
             chamfer: chamfer(&drawn, &truth.points)?,

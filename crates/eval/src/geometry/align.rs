@@ -7,6 +7,8 @@ use snapsnap_splat::RigidTransform;
 use super::{check_points, double, nearest};
 use crate::EvalError;
 
+/// Number of points that are aligned. The truth has ten times as many.
+pub(crate) const ALIGNED: usize = 5_000;
 /// Largest number of steps.
 const MOST: usize = 100;
 /// Least relative decrease of the mean squared distance in a step.
@@ -75,7 +77,7 @@ impl Alignment {
 /// must be below some 30° and a quarter of the size.
 ///
 /// # Errors
-/// [`EvalError::Empty`] for a set without points or with one that is not finite.
+/// [`EvalError::Message`] for a set without points or with one that is not finite.
 pub fn icp(points: &[[f32; 3]], onto: &[[f32; 3]], scale: bool) -> Result<Alignment, EvalError> {
     check_points(points)?;
     check_points(onto)?;

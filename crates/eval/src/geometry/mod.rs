@@ -4,7 +4,6 @@
 mod align;
 mod normals;
 
-use burn::tensor::Tensor;
 use glam::DVec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use parry3d::math::Vector;
@@ -14,9 +13,11 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use snapsnap_mesh::mesh::Mesh;
+use snapsnap_ops::host;
+use snapsnap_splat::Gaussians;
 
 use crate::EvalError;
-pub(crate) use align::procrustes;
+pub(crate) use align::{ALIGNED, procrustes};
 pub use align::{Align, Alignment, icp};
 pub use normals::{consistency, normals};
 
@@ -39,27 +40,38 @@ impl Chamfer {
     }
 }
 
-/// Rows of a tensor `[N, 3]`.
+/// Centres of at most `most` Gaussians with an opacity of at least `opaque`.
 ///
 /// # Errors
-/// [`EvalError::Sizes`] for another shape, [`EvalError::Empty`] if there is no row or a row is not finite.
-pub fn points(tensor: &Tensor<2>) -> Result<Vec<[f32; 3]>, EvalError> {
-    let [n, columns] = tensor.dims();
-    if columns != 3 {
-        return Err(EvalError::Sizes { found: vec![n, columns], expected: vec![n, 3] });
+/// [`EvalError::Message`] if no Gaussian is so opaque.
+pub(crate) fn opaque_centres(
+    gaussians: &Gaussians,
+    opaque: f32,
+    most: usize,
+) -> Result<Vec<[f32; 3]>, EvalError> {
+    let means = host(gaussians.means.clone());
+    let centres = means.as_chunks().0.iter().zip(host(gaussians.opacities.clone()));
+    let centres: Vec<[f32; 3]> = centres.filter(|(_, own)| *own >= opaque).map(|(p, _)| *p).collect();
+    if centres.is_empty() {
+        let message = format!("no Gaussian has an opacity of {opaque} or more (`metrics.opaque`)");
+        return Err(EvalError::Message(message));
     }
-    let rows = snapsnap_ops::host(tensor.clone()).as_chunks::<3>().0.to_vec();
-    check_points(&rows)?;
-    Ok(rows)
+    Ok(thinned(&centres, most))
+}
+
+/// At most `most` entries of a list, at equal steps.
+pub(crate) fn thinned<T: Copy>(all: &[T], most: usize) -> Vec<T> {
+    let kept = all.len().min(most);
+    (0..kept).map(|i| all[i * all.len() / kept]).collect()
 }
 
 fn check_points(points: &[[f32; 3]]) -> Result<(), EvalError> {
     if points.is_empty() {
-        return Err(EvalError::Empty("there is no point".into()));
+        return Err(EvalError::Message("there is no point".into()));
     }
     // Written so that a NaN fails as well.
     match points.iter().position(|p| !p.iter().all(|v| v.abs() <= FARTHEST)) {
-        Some(row) => Err(EvalError::Empty(format!("point {row} is not finite, or beyond {FARTHEST:e} m"))),
+        Some(row) => Err(EvalError::Message(format!("point {row} is not finite, or beyond {FARTHEST:e} m"))),
         None => Ok(()),
     }
 }
@@ -67,7 +79,7 @@ fn check_points(points: &[[f32; 3]]) -> Result<(), EvalError> {
 /// Mean Euclidean distances to the nearest neighbour, both ways.
 ///
 /// # Errors
-/// [`EvalError::Empty`] for a set without points or with one that is not finite.
+/// [`EvalError::Message`] for a set without points or with one that is not finite.
 pub fn chamfer(a: &[[f32; 3]], b: &[[f32; 3]]) -> Result<Chamfer, EvalError> {
     check_points(a)?;
     check_points(b)?;
@@ -98,7 +110,7 @@ pub(crate) fn distance(a: [f32; 3], b: [f32; 3]) -> f64 {
 /// Mean Euclidean distance from points to the triangles of a mesh.
 ///
 /// # Errors
-/// [`EvalError::Empty`] without points, if a point is not finite, or for a mesh without area.
+/// [`EvalError::Message`] without points, if a point is not finite, or for a mesh without area.
 pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalError> {
     check_points(points)?;
     check_points(&mesh.positions.iter().map(|p| p.to_array()).collect::<Vec<_>>())?;
@@ -109,7 +121,7 @@ pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalErr
     faces.sort_unstable();
     faces.dedup();
     let surface = TriMesh::new(vertices, faces)
-        .map_err(|e| EvalError::Empty(format!("the mesh has no surface: {e}")))?;
+        .map_err(|e| EvalError::Message(format!("the mesh has no surface: {e}")))?;
     let apart = |p: &[f32; 3]| {
         let on = surface.project_local_point(Vector::new(p[0], p[1], p[2]), false).point;
         distance(*p, [on.x, on.y, on.z])
@@ -121,7 +133,7 @@ pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalErr
 /// Points drawn uniformly from the surface of a mesh. One seed always draws the same points.
 ///
 /// # Errors
-/// [`EvalError::Empty`] for a mesh without area.
+/// [`EvalError::Message`] for a mesh without area.
 pub fn sampled(mesh: &Mesh, count: usize, seed: u64) -> Result<Vec<[f32; 3]>, EvalError> {
     let corners = |face: usize| mesh.faces[face].positions.map(|row| mesh.positions[row as usize].as_dvec3());
     let mut total = 0.0;
@@ -133,7 +145,7 @@ pub fn sampled(mesh: &Mesh, count: usize, seed: u64) -> Result<Vec<[f32; 3]>, Ev
         })
         .collect();
     if !(total > 0.0 && total.is_finite()) {
-        return Err(EvalError::Empty("the mesh has no area".into()));
+        return Err(EvalError::Message("the mesh has no area".into()));
     }
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut one = || {

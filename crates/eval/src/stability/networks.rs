@@ -5,7 +5,7 @@ use std::sync::Arc;
 use burn::tensor::{DType, Device, Tensor};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use snapsnap_net::config::{Anchor, ConfMode, NetworkConfig, RegressorConfig};
+use snapsnap_net::config::{Anchor, ConfMode, NetworkConfig};
 use snapsnap_net::network::activate;
 use snapsnap_net::precision::Precision;
 use snapsnap_net::regressor::{Attributes, Regressor, Statistics};
@@ -173,7 +173,7 @@ fn attributes(device: &Device) -> Found {
         .flat_map(|v| (0..14).map(move |i| if i % 2 == 0 { *v } else { -*v }))
         .collect();
     let x = tracked(rows, [2, 14], device);
-    let made = Attributes::new(&RegressorConfig::default(), x.clone(), None);
+    let made = Attributes::from_features(x.clone());
     let made = Tensor::cat(vec![made.opacity, made.scale, made.rotation, made.color, made.offset], 1);
     let gradient = gradient_of_sum(&made, &x);
     let made = host(made);

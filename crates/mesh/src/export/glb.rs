@@ -4,14 +4,14 @@ use std::collections::HashMap;
 use std::io::{self, Write};
 use std::path::Path;
 
-use glam::{DVec3, Vec2, Vec3};
+use glam::{Vec2, Vec3};
 use gltf::binary::{Glb, Header};
 use serde_json::{Value, json};
 use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
 
 use super::png;
-use crate::mesh::{Face, Mesh};
+use crate::mesh::{Face, Mesh, bounds};
 
 /// glTF's codes of number types.
 const U16: u32 = 5123;
@@ -21,37 +21,34 @@ const F32: u32 = 5126;
 const ATTRIBUTES: u32 = 34962;
 const INDICES: u32 = 34963;
 
-pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
-    let bytes = glb_bytes(mesh, offset).map_err(FileError::write(path))?;
+pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
+    let bytes = glb_bytes(mesh).map_err(FileError::write(path))?;
     write_whole(path, |out| out.write_all(&bytes)).map_err(FileError::write(path))
 }
 
-/// The bytes of a binary glTF with one node and one primitive for each material. Colours contain the light of the photographs,
-/// so that materials are unlit (KHR_materials_unlit), and rough for viewers without that extension.
-/// The node moves the mesh by `offset`, metres.
+/// Encodes a binary glTF with one node and one primitive per material. Colours contain the light of the photographs.
+/// Materials are therefore unlit (KHR_materials_unlit), and rough for viewers without this extension.
 ///
 /// # Errors
 /// If a texture cannot be encoded.
-pub fn glb_bytes(mesh: &Mesh, offset: DVec3) -> io::Result<Vec<u8>> {
+pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
     let mut file = Content::default();
     let (rows, faces) = vertices(mesh);
     let normals = mesh.normals();
     let positions: Vec<Vec3> = rows.iter().map(|(p, _)| mesh.positions[*p as usize]).collect();
-    let (low, high) = positions
-        .iter()
-        .fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), p| (low.min(*p), high.max(*p)));
+    let (low, high) = bounds(positions.iter().copied());
     let mut attributes = serde_json::Map::new();
-    let bounds = json!({ "min": low.to_array(), "max": high.to_array() });
-    let places = file.floats(rows.len(), "VEC3", positions.iter().flat_map(|p| p.to_array()), bounds);
+    let range = json!({ "min": low.to_array(), "max": high.to_array() });
+    let places = file.floats(rows.len(), "VEC3", positions.iter().flat_map(|p| p.to_array()), range);
     attributes.insert("POSITION".into(), places);
     let normals = rows.iter().flat_map(|(p, _)| match normals[*p as usize] {
-        // A position without area has no normal, but glTF requires one of length 1.
+        // A vertex of degenerate faces has no normal, but glTF requires one of length 1.
         Vec3::ZERO => Vec3::Y.to_array(),
         normal => normal.to_array(),
     });
     attributes.insert("NORMAL".into(), file.floats(rows.len(), "VEC3", normals, json!({})));
     if !mesh.colors.is_empty() {
-        // Colours are linear in glTF, for which 8 bits do not suffice. Rows take a multiple of 4 bytes.
+        // Colours are linear in glTF, for which 8 bits do not suffice. A vertex takes a multiple of 4 bytes.
         let color = |(p, _): &Vertex| {
             let [r, g, b] = mesh.colors[*p as usize].to_array().map(linear);
             [r, g, b, 1.0].map(|c| (c * f32::from(u16::MAX)).round() as u16)
@@ -61,7 +58,7 @@ pub fn glb_bytes(mesh: &Mesh, offset: DVec3) -> io::Result<Vec<u8>> {
         attributes.insert("COLOR_0".into(), file.accessor(colors, U16, rows.len(), "VEC4", normalized));
     }
     if rows.iter().any(|(_, t)| t.is_some()) {
-        // glTF's textures begin at the top.
+        // The origin of glTF's texture coordinates is at the top.
         let texcoord = |t: Option<u32>| t.map_or(Vec2::ZERO, |t| mesh.texcoords[t as usize]);
         let texcoords = rows.iter().map(|(_, t)| texcoord(*t)).flat_map(|t| [t.x, 1.0 - t.y]);
         attributes.insert("TEXCOORD_0".into(), file.floats(rows.len(), "VEC2", texcoords, json!({})));
@@ -93,16 +90,12 @@ pub fn glb_bytes(mesh: &Mesh, offset: DVec3) -> io::Result<Vec<u8>> {
             primitives.push(json!({ "attributes": attributes, "indices": indices, "material": row }));
         }
     }
-    let mut node = json!({ "mesh": 0, "name": "person" });
-    if offset != DVec3::ZERO {
-        node["translation"] = json!(offset.to_array());
-    }
     let mut document = json!({
         "asset": { "version": "2.0", "generator": "snapsnap" },
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],
-        "nodes": [node],
+        "nodes": [{ "mesh": 0, "name": "person" }],
         "meshes": [{ "primitives": primitives }],
         "materials": materials,
         "accessors": file.accessors,
@@ -119,10 +112,10 @@ pub fn glb_bytes(mesh: &Mesh, offset: DVec3) -> io::Result<Vec<u8>> {
     file.finish(&document)
 }
 
-/// Rows of a position and of its texture coordinates, if it has some.
+/// Indices of a position and of its texture coordinates, if any.
 type Vertex = (u32, Option<u32>);
 
-/// The distinct vertices, and the rows of each face's vertices.
+/// The distinct vertices, and the indices of each face's vertices.
 fn vertices(mesh: &Mesh) -> (Vec<Vertex>, Vec<[u32; 3]>) {
     let (mut rows, mut known) = (Vec::new(), HashMap::new());
     let mut row = |vertex: Vertex| {
@@ -136,7 +129,7 @@ fn vertices(mesh: &Mesh) -> (Vec<Vertex>, Vec<[u32; 3]>) {
     (rows, faces)
 }
 
-/// The binary part, and the JSON that describes it.
+/// The binary chunk, and the JSON that describes it.
 #[derive(Default)]
 struct Content {
     bytes: Vec<u8>,
@@ -145,7 +138,7 @@ struct Content {
 }
 
 impl Content {
-    /// Adds bytes; returns the view's row.
+    /// Adds a buffer view and returns its index.
     fn view(&mut self, bytes: impl IntoIterator<Item = u8>, target: Option<u32>) -> usize {
         let start = self.bytes.len();
         self.bytes.extend(bytes);
@@ -158,13 +151,13 @@ impl Content {
         self.views.len() - 1
     }
 
-    /// Adds vectors of numbers; returns the accessor's row.
+    /// Adds an accessor of `count` vectors and returns its index.
     fn floats(&mut self, count: usize, shape: &str, values: impl Iterator<Item = f32>, more: Value) -> Value {
         let view = self.view(values.flat_map(f32::to_le_bytes), Some(ATTRIBUTES));
         self.accessor(view, F32, count, shape, more)
     }
 
-    /// Describes the content of a view; returns the accessor's row.
+    /// Adds an accessor for a buffer view and returns its index.
     fn accessor(&mut self, view: usize, kind: u32, count: usize, shape: &str, more: Value) -> Value {
         let mut accessor =
             json!({ "bufferView": view, "componentType": kind, "count": count, "type": shape });

@@ -8,19 +8,18 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use glam::DVec3;
 use image::{ImageFormat, RgbImage};
 use snapsnap_base::FileError;
 
 use crate::mesh::Mesh;
 
 pub use glb::glb_bytes;
-pub use obj::write_obj;
+pub use obj::write as write_obj;
 
-/// Kinds of files for a mesh.
+/// File formats of a mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// Wavefront OBJ, its materials and textures beside it.
+    /// Wavefront OBJ, with materials and textures in separate files.
     Obj,
     /// Binary PLY with vertex colours, without textures.
     Ply,
@@ -29,7 +28,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// The kind that the extension of `path` names, if any.
+    /// The format of the extension of `path`, if it is known.
     pub fn named(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
         match extension.as_str() {
@@ -41,21 +40,20 @@ impl Kind {
     }
 }
 
-/// Writes `mesh` to `path` as the kind that its extension names, or else as GLB. Each file is written as a whole or not at
-/// all. An OBJ comes after its pictures and materials. `offset` is the place of the mesh's origin in the world, metres. Far from the
-/// world's origin f32 is too coarse for positions, so that an OBJ and a PLY then contain f64, and a GLB moves its node.
+/// Writes `mesh` to `path` in the format of the extension, GLB by default. Each file is written as a whole or not at
+/// all, an OBJ after its textures and materials.
 ///
 /// # Errors
 /// [`FileError::Write`]; [`FileError::Unsuitable`] for a texture in a PLY.
-pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
+pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
     match Kind::named(path) {
-        Some(Kind::Obj) => obj::write(mesh, offset, path),
-        Some(Kind::Ply) => ply::write(mesh, offset, path),
-        Some(Kind::Glb) | None => glb::write(mesh, offset, path),
+        Some(Kind::Obj) => obj::write(mesh, path),
+        Some(Kind::Ply) => ply::write(mesh, path),
+        Some(Kind::Glb) | None => glb::write(mesh, path),
     }
 }
 
-/// The files that [`write()`] writes beside `path` for a mesh with one texture, or with colours of positions.
+/// Additional files that [`write()`] writes for a mesh with one texture, or without one.
 pub fn companions(path: &Path, textured: bool) -> Vec<PathBuf> {
     match Kind::named(path) {
         Some(Kind::Obj) if textured => vec![path.with_extension("mtl"), obj::texture_beside(path, 0)],

@@ -6,23 +6,19 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use glam::{DVec3, Vec3};
+use glam::Vec3;
 use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
 
 use super::png;
 use crate::mesh::Mesh;
 
-/// Writes `mesh` to `path`, with its materials and textures beside it under the same name; the OBJ is written last. Colours of
-/// positions need no material unless it has a colour of its own. A white one would hide them in many programs.
+/// Writes `mesh` to `path`, and its materials and textures under the same name beside it. The OBJ is written last.
+/// Vertex colours without textures get no white material, which would hide them in many programs.
 ///
 /// # Errors
 /// [`FileError::Write`].
-pub fn write_obj(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
-    write(mesh, DVec3::ZERO, path)
-}
-
-pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
+pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(folder).map_err(FileError::write(folder))?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -52,19 +48,14 @@ pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
             writeln!(out, "mtllib {stem}.mtl")?;
         }
         for (row, p) in mesh.positions.iter().enumerate() {
-            if offset == DVec3::ZERO {
-                write!(out, "v {} {} {}", p.x, p.y, p.z)?;
-            } else {
-                let p = p.as_dvec3() + offset;
-                write!(out, "v {} {} {}", p.x, p.y, p.z)?;
-            }
+            write!(out, "v {} {} {}", p.x, p.y, p.z)?;
             match mesh.colors.get(row) {
                 Some(c) => writeln!(out, " {} {} {}", c.x, c.y, c.z)?,
                 None => writeln!(out)?,
             }
         }
         for n in &normals {
-            // A position without area has no normal.
+            // A vertex of degenerate faces has no normal.
             let n = if *n == Vec3::ZERO { Vec3::Y } else { *n };
             writeln!(out, "vn {} {} {}", n.x, n.y, n.z)?;
         }
@@ -88,7 +79,7 @@ pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
     .map_err(FileError::write(path))
 }
 
-/// Path of the texture of this number.
+/// Path of the texture with this number.
 pub fn texture_beside(path: &Path, number: usize) -> PathBuf {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     path.with_file_name(format!("{stem}_{number}.png"))

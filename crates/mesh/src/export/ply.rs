@@ -3,21 +3,19 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use glam::DVec3;
 use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
 
-use crate::mesh::Mesh;
+use crate::mesh::{Mesh, bytes};
 
-pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
+pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
     if mesh.materials.iter().any(|material| material.texture.is_some()) {
         let message = "a PLY has vertex colours and no texture: write a .glb or .obj";
         return Err(FileError::unsuitable(path, message));
     }
     write_whole(path, |out| {
         writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}", mesh.positions.len())?;
-        let (is_far, kind) = if offset == DVec3::ZERO { (false, "float") } else { (true, "double") };
-        ["x", "y", "z"].iter().try_for_each(|axis| writeln!(out, "property {kind} {axis}"))?;
+        ["x", "y", "z"].iter().try_for_each(|axis| writeln!(out, "property float {axis}"))?;
         if !mesh.colors.is_empty() {
             write!(out, "property uchar red\nproperty uchar green\nproperty uchar blue\n")?;
         }
@@ -27,16 +25,9 @@ pub fn write(mesh: &Mesh, offset: DVec3, path: &Path) -> Result<(), FileError> {
             mesh.faces.len()
         )?;
         for (row, p) in mesh.positions.iter().enumerate() {
-            if is_far {
-                (p.as_dvec3() + offset)
-                    .to_array()
-                    .iter()
-                    .try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
-            } else {
-                p.to_array().iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
-            }
+            p.to_array().iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
             if let Some(color) = mesh.colors.get(row) {
-                out.write_all(&color.to_array().map(|c| (c * 255.0).round() as u8))?;
+                out.write_all(&bytes(*color))?;
             }
         }
         for face in &mesh.faces {

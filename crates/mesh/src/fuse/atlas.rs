@@ -1,4 +1,4 @@
-//! A texture for a surface. Charts, pieces that face one way, are laid flat beside one another.
+//! Texture atlas of a surface. Charts, pieces that face one direction, are projected and packed side by side.
 
 use std::collections::{HashSet, VecDeque};
 
@@ -11,28 +11,28 @@ use crate::mesh::Mesh;
 const FILLED: f32 = 0.75;
 /// Factor by which texels grow from one try to the next.
 const COARSER: f32 = 1.06;
-/// Free texels around each chart. They get its colours, so that filters do not reach its neighbours.
+/// Padding around each chart in texels. It gets the chart's colours, so that filters do not reach other charts.
 const PADDING: i32 = 3;
 /// Least cosine between the normal of a chart's face and the chart's axis.
 const FLATTEST: f32 = 0.4;
-/// Most tries to find room.
+/// Largest number of tries to pack the charts.
 const TRIES: usize = 200;
-/// Most tries in a row with too many charts and no fewer than before.
+/// Largest number of successive tries that have too many charts and do not reduce their number.
 const IN_VAIN: usize = 10;
 
 /// A texel of the surface.
 pub struct Texel {
     /// Index into the texture, row by row.
     pub at: u32,
-    /// In the units of [`super::Placing`].
+    /// Position, metres from the body's centre.
     pub place: Vec3,
-    /// Unit vector outwards.
+    /// Unit normal, outwards.
     pub normal: Vec3,
     /// Interpolated between the face's corners.
     pub color: Vec3,
 }
 
-/// Places of a mesh's faces on a square texture.
+/// Layout of a mesh's faces on a square texture.
 pub struct Atlas {
     /// Texture coordinates of each face's corners, (0, 0) at the lower left.
     pub texcoords: Vec<[Vec2; 3]>,
@@ -40,11 +40,11 @@ pub struct Atlas {
     pub texels: Vec<Texel>,
 }
 
-/// Faces that do not cover one another along an axis.
+/// Faces whose projections along an axis do not overlap.
 struct Chart {
     axis: usize,
     faces: Vec<usize>,
-    /// Smallest and largest texel before the chart is placed.
+    /// First and last texel of the chart before packing.
     low: IVec2,
     high: IVec2,
 }
@@ -52,7 +52,7 @@ struct Chart {
 /// Lays the faces of `mesh` on a texture of `side`² pixels.
 ///
 /// # Errors
-/// If there are too many charts for it, or the surface is not closed.
+/// If the charts do not fit, or the surface is not closed.
 pub fn atlas(mesh: &Mesh, side: usize) -> Result<Atlas, String> {
     let axes: Vec<usize> = (0..mesh.faces.len()).map(|face| axis(mesh, face)).collect();
     let triangles: Vec<[u32; 3]> = mesh.faces.iter().map(|face| face.positions).collect();
@@ -70,7 +70,7 @@ pub fn atlas(mesh: &Mesh, side: usize) -> Result<Atlas, String> {
         if let Some(places) = pack(&charts, side as i32) {
             return Ok(lay(mesh, &charts, &places, side, texel));
         }
-        // Coarser texels make charts smaller, down to one texel and its padding, and at first fewer.
+        // Coarser texels make charts smaller, down to one texel and its padding, and at first also fewer.
         let has_room = charts.len() * (1 + 2 * PADDING as usize).pow(2) <= side * side;
         vain = if has_room || charts.len() < fewest { 0 } else { vain + 1 };
         fewest = fewest.min(charts.len());
@@ -86,7 +86,7 @@ fn corners(mesh: &Mesh, face: usize) -> [Vec3; 3] {
     mesh.faces[face].positions.map(|row| mesh.positions[row as usize])
 }
 
-/// Normal of a face, as long as twice its area.
+/// Normal of a face with twice the face's area as its length.
 fn normal(mesh: &Mesh, face: usize) -> Vec3 {
     let [a, b, c] = corners(mesh, face);
     (b - a).cross(c - a)
@@ -128,7 +128,7 @@ fn charts(mesh: &Mesh, axes: &[usize], across: &[usize], texel: f32) -> Vec<Char
             let triangle = flat(mesh, face, chart.axis, texel);
             let mut texels = Vec::new();
             inside(triangle, |at, _| texels.push(at));
-            // Faces before or behind a part of this chart go into another one.
+            // A face that overlaps this chart in the projection goes into another chart.
             if texels.iter().any(|at| covered.contains(at)) {
                 continue;
             }
@@ -167,7 +167,7 @@ fn inside(triangle: [Vec2; 3], mut each: impl FnMut(IVec2, Vec3)) {
     }
 }
 
-/// Places of the charts' smallest texels. The charts stand on shelves, the highest first.
+/// Shelf packing, the highest charts first. Returns the position of each chart's first texel, `None` without room.
 fn pack(charts: &[Chart], side: i32) -> Option<Vec<IVec2>> {
     let size = |chart: &Chart| chart.high - chart.low + 1 + 2 * PADDING;
     let mut order: Vec<usize> = (0..charts.len()).collect();
@@ -216,7 +216,7 @@ fn lay(mesh: &Mesh, charts: &[Chart], places: &[IVec2], side: usize, texel: f32)
     Atlas { texcoords, texels }
 }
 
-/// Spreads colours to texels without one, as far as filters reach.
+/// Dilates the colours into empty texels by [`PADDING`].
 pub fn spread(texture: &mut [Option<[u8; 3]>], side: usize) {
     for _ in 0..PADDING {
         // Collected first, so that colours spread by one texel per round.

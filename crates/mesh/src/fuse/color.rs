@@ -1,4 +1,4 @@
-//! Colours of a surface, from the views that meet it most squarely.
+//! Vertex colours of a surface, from the views that face it.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -6,14 +6,14 @@ use rayon::prelude::*;
 use super::views::View;
 use crate::mesh::Mesh;
 
-/// Largest distance between a place and the surface that a view shows there, in cubes of the field.
+/// Largest distance between a point and the surface in a view that gives the point its colour, in cubes of the field.
 pub const REACH: f32 = 3.0;
 /// The weight of a view is its cosine to this power.
 const SHARPNESS: i32 = 6;
-/// Number of times that colours spread to neighbours that no view shows.
+/// Number of rounds in which colours spread to neighbours that no view shows.
 const ROUNDS: usize = 200;
 
-/// Weighted mean of the views' colours of a place.
+/// Weighted mean of a point's colours in the views.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Mean {
     sum: Vec3,
@@ -21,7 +21,7 @@ pub struct Mean {
 }
 
 impl Mean {
-    /// Adds a view, if it shows a place that faces along `normal`.
+    /// Adds a view if it shows the point `place`, whose normal is `normal`.
     pub fn add(&mut self, view: &View, place: Vec3, normal: Vec3, reach: f32) {
         let square = -view.towards(place).dot(normal);
         if square <= 0.0 {
@@ -34,7 +34,7 @@ impl Mean {
         }
     }
 
-    /// The colour, if any view showed the place.
+    /// The colour, if any view showed the point.
     pub fn color(&self) -> Option<Vec3> {
         (self.weight > 0.0).then(|| (self.sum / self.weight).clamp(Vec3::ZERO, Vec3::ONE))
     }

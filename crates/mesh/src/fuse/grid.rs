@@ -8,9 +8,9 @@ use rayon::prelude::*;
 /// Signed distances at the corners of cubes, negative inside. The corners on the border are outside.
 #[derive(Debug, Clone)]
 pub struct Grid {
-    /// Place of the first corner, in the units of [`super::Placing`].
+    /// Position of the first corner, metres from the body's centre.
     pub origin: Vec3,
-    /// Edge of a cube, in the same units.
+    /// Edge of a cube, metres.
     pub cell: f32,
     /// Corners along x, y and z.
     pub counts: USizeVec3,
@@ -18,7 +18,7 @@ pub struct Grid {
     pub values: Vec<f32>,
 }
 
-/// Steps from a corner to half of those that share an edge with it. The steps to the others have the opposite sign. Every
+/// Offsets to half of the corners that share an edge with a corner. The other offsets have the opposite sign. Every
 /// cube consists of six tetrahedra around its diagonal (Kuhn's subdivision).
 pub const STEPS: [[usize; 3]; 7] =
     [[1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
@@ -31,11 +31,11 @@ const TETRAHEDRA: [([usize; 3], bool); 6] = [
     ([2, 1, 0], true),
     ([1, 0, 2], true),
 ];
-/// Least distance of the surface from the ends of an edge, as a share of the edge. It keeps triangles from having no area.
+/// Smallest distance of the surface from the ends of an edge, as a share of the edge. It avoids degenerate triangles.
 const CLEARANCE: f32 = 0.05;
 
-/// Connected corners with the same sign. The edges of the tetrahedra connect them, so that the surface between two pieces
-/// is connected too.
+/// Connected components of corners with the same sign. Edges of tetrahedra connect corners, so that the surface
+/// between two pieces is connected, too.
 pub struct Pieces {
     /// For every corner the number of its piece.
     pub of: Vec<u32>,
@@ -50,10 +50,8 @@ pub struct Pieces {
 pub struct Kept {
     /// Dropped pieces of the inside.
     pub dropped: usize,
-    /// Corners of the largest dropped piece, as a share of the body's.
+    /// Corners of the largest dropped piece, as a share of the body's corners.
     pub largest_dropped: f64,
-    /// Filled pieces of the outside.
-    pub filled: usize,
 }
 
 impl Pieces {
@@ -69,13 +67,13 @@ impl Pieces {
 }
 
 impl Grid {
-    /// Number of a corner along each axis.
+    /// Coordinates of a corner in the grid.
     pub fn at(&self, row: usize) -> USizeVec3 {
         let USizeVec3 { x: nx, y: ny, .. } = self.counts;
         USizeVec3::new(row % nx, row / nx % ny, row / (nx * ny))
     }
 
-    /// Place of a corner.
+    /// Position of a corner.
     pub fn place(&self, row: usize) -> Vec3 {
         self.origin + self.cell * self.at(row).as_vec3()
     }
@@ -84,7 +82,7 @@ impl Grid {
         [1, self.counts.x, self.counts.x * self.counts.y]
     }
 
-    /// Distances between rows of corners that share an edge of a tetrahedron.
+    /// [`STEPS`] as differences of indices.
     fn steps(&self) -> [usize; 7] {
         let strides = self.strides();
         STEPS.map(|step| (0..3).map(|axis| step[axis] * strides[axis]).sum())
@@ -114,7 +112,7 @@ impl Grid {
                 let border = self.on_border(row);
                 for step in steps {
                     for next in [row.checked_sub(step), row.checked_add(step)].into_iter().flatten() {
-                        // A step from the border may end at the other side of the grid.
+                        // A step from the border may wrap around to the other side of the grid.
                         let wraps = || {
                             let apart = self.at(row).as_i64vec3() - self.at(next).as_i64vec3();
                             apart.abs().max_element() > 1
@@ -161,11 +159,10 @@ impl Grid {
                 *value = -value.max(f32::MIN_POSITIVE);
             }
         }
-        // All pieces but the body and the outside around it.
-        Kept { dropped, largest_dropped, filled: pieces.sizes.len() - 2 }
+        Kept { dropped, largest_dropped }
     }
 
-    /// Number of positions of the [`Self::surface`].
+    /// Number of positions that [`Self::surface`] returns.
     pub fn crossings(&self) -> usize {
         let steps = self.steps();
         let inside = |row: usize| self.values[row] < 0.0;
@@ -195,8 +192,8 @@ impl Grid {
             .collect();
     }
 
-    /// The closed surface between inside and outside, from every cube's six tetrahedra. Each edge has two triangles, which
-    /// are counter-clockwise as seen from outside.
+    /// Marching tetrahedra: the closed surface between inside and outside. Each edge has two triangles. Triangles are
+    /// counter-clockwise as seen from outside.
     pub fn surface(&self) -> (Vec<Vec3>, Vec<[u32; 3]>) {
         let strides = self.strides();
         let mut corners = HashMap::new();
@@ -237,7 +234,7 @@ fn tetrahedron(
     between: &mut impl FnMut(usize, usize) -> u32,
     faces: &mut Vec<[u32; 3]>,
 ) {
-    // Corners inside come first. Every exchange of neighbours mirrors the tetrahedron.
+    // Sorts the corners inside to the front. Each swap mirrors the tetrahedron.
     let mut sorted = corners;
     let mut mirrored = left_handed;
     for end in (1..4).rev() {
@@ -262,7 +259,7 @@ fn tetrahedron(
             face([quad[0], quad[1], quad[2]]);
             face([quad[0], quad[2], quad[3]]);
         }
-        // (d, c, b, a) is (a, b, c, d) after two exchanges, and only d is outside.
+        // Only d is outside. (d, c, b, a) is (a, b, c, d) after two swaps, which keep the orientation.
         3 => face([between(d, a), between(d, b), between(d, c)]),
         _ => {}
     }
@@ -317,8 +314,9 @@ pub(super) mod tests {
         // Small pieces inside, then small pieces outside.
         let Kept { dropped, .. } = grid(24, |p| noise(p) + 0.95).keep_one_body();
         let mut grid = grid(24, |p| noise(p) - 0.95);
-        let Kept { filled, .. } = grid.keep_one_body();
-        assert!(dropped > 10 && filled > 10, "{dropped} {filled}");
+        let before = grid.pieces().sizes.len();
+        grid.keep_one_body();
+        assert!(dropped > 10 && before > 12, "{dropped} {before}");
         assert_eq!(grid.keep_one_body(), Kept::default());
         assert_eq!(grid.pieces().sizes.len(), 2);
         grid.values.iter_mut().for_each(|value| *value += 0.95);
@@ -334,7 +332,7 @@ pub(super) mod tests {
         let speck = |p: Vec3| (p - Vec3::splat(0.85)).length() - 0.09;
         let mut grid = grid(41, |p| hollow(p).min(speck(p)));
         let kept = grid.keep_one_body();
-        assert_eq!((kept.dropped, kept.filled), (1, 1));
+        assert_eq!(kept.dropped, 1);
         // (0.09/0.75)³ without the hollow.
         assert!((0.0005..0.005).contains(&kept.largest_dropped), "{kept:?}");
         let (positions, faces) = grid.surface();

@@ -1,29 +1,31 @@
-//! Repair of closed surfaces some of whose edges fell onto one another.
+//! Repair of closed surfaces in which edges coincide.
 
 use std::collections::{HashMap, HashSet};
 
 use glam::Vec3;
 
-/// Distance by which copies of a position move into their body, as a share of the mean length of edges there.
+use crate::mesh::pieces;
+
+/// Distance by which a copy of a position moves inwards, as a share of the mean length of the edges there.
 const APART: f32 = 0.02;
 
 /// A surface with two triangles at every edge and one fan at every position.
 pub struct Manifold {
-    /// Rows of `places`.
+    /// Indices into `places`.
     pub triangles: Vec<[u32; 3]>,
-    /// Places of the positions, behind which those of copies continue.
+    /// Positions, followed by the copies.
     pub places: Vec<Vec3>,
-    /// For each place the row of its position.
+    /// For each entry of `places` the index of its original position.
     pub sources: Vec<u32>,
-    /// For each side the other triangle's side along the same edge. Side 3 t + c of triangle t begins with its corner c.
+    /// For each side the other triangle's side along the same edge. Side 3 t + c of triangle t begins at its corner c.
     pub across: Vec<usize>,
 }
 
-/// Removes pairs of triangles that lie on one another and face opposite ways. Cuts the surface apart where more than two
-/// triangles meet at an edge, or several fans at a position, so that bodies that touched there do so no longer.
+/// Removes pairs of triangles that coincide and face opposite directions. Cuts the surface apart where more than two
+/// triangles meet at an edge, or several fans at a position.
 ///
-/// Each edge must have as many triangles along it in one direction as in the other, or there is no result. Collapsing edges of
-/// a closed surface preserves this.
+/// `None` unless each edge has as many triangles along it in one direction as in the other. Collapsing edges of a
+/// closed surface preserves this.
 pub fn manifold(positions: &[Vec3], triangles: Vec<[u32; 3]>) -> Option<Manifold> {
     let triangles = unfolded(triangles);
     let across = across(positions, &triangles)?;
@@ -44,7 +46,7 @@ impl Manifold {
             if known[first] {
                 continue;
             }
-            // The sides that begin with the same position as this one.
+            // The sides of the fan, which begin at the same position.
             fan.clear();
             let mut side = first;
             while !known[side] {
@@ -68,8 +70,8 @@ impl Manifold {
         }
     }
 
-    /// Splits every edge that still has more than two triangles because the fans at both its ends pass it twice. Each pair of
-    /// triangles gets a position of its own in the middle.
+    /// Splits every edge that still has more than two triangles because the fans at both ends pass it twice. Each
+    /// pair of triangles gets its own position in the middle.
     fn part_edges(&mut self) {
         let mut there = HashSet::new();
         let corners = self.triangles.as_flattened();
@@ -112,13 +114,13 @@ impl Manifold {
         (self.across[side], self.across[other]) = (other, side);
     }
 
-    /// Places of the corners of the side's triangle, from the side's first corner on.
+    /// Positions of the corners of the side's triangle, beginning at the side's first corner.
     fn corners(&self, side: usize) -> [Vec3; 3] {
         let rows = self.triangles.as_flattened();
         [0, 1, 2].map(|step| self.places[rows[around(side, step)] as usize])
     }
 
-    /// Row of a new copy of the position in this row.
+    /// Adds a copy of the position `row` at `place` and returns its index.
     fn copy(&mut self, row: u32, place: Vec3) -> u32 {
         self.sources.push(self.sources[row as usize]);
         self.places.push(place);
@@ -127,24 +129,8 @@ impl Manifold {
 
     /// For each triangle the number of its piece, and the number of pieces.
     pub fn pieces(&self) -> (Vec<usize>, usize) {
-        let mut piece = vec![usize::MAX; self.triangles.len()];
-        let (mut count, mut waiting) = (0, Vec::new());
-        for first in 0..piece.len() {
-            if piece[first] != usize::MAX {
-                continue;
-            }
-            piece[first] = count;
-            waiting.push(first);
-            while let Some(face) = waiting.pop() {
-                for next in self.across[3 * face..3 * face + 3].iter().map(|side| side / 3) {
-                    if piece[next] == usize::MAX {
-                        piece[next] = count;
-                        waiting.push(next);
-                    }
-                }
-            }
-            count += 1;
-        }
+        let piece = pieces(self.places.len(), self.triangles.iter().map(|triangle| &triangle[..]));
+        let count = piece.iter().max().map_or(0, |last| last + 1);
         (piece, count)
     }
 }
@@ -154,7 +140,7 @@ fn around(side: usize, steps: usize) -> usize {
     side - side % 3 + (side + steps) % 3
 }
 
-/// Removes triangles with fewer than three corners, and pairs with the same corners in opposite orders.
+/// Removes triangles without three distinct corners, and pairs with the same corners in opposite order.
 fn unfolded(mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
     let mut there: HashMap<[u32; 3], Vec<usize>> = HashMap::new();
     let mut kept = vec![true; triangles.len()];
@@ -176,9 +162,9 @@ fn unfolded(mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
     triangles
 }
 
-/// [`Manifold::across`], if every side has another one.
+/// Computes [`Manifold::across`]; `None` if a side has no partner.
 pub fn across(positions: &[Vec3], triangles: &[[u32; 3]]) -> Option<Vec<usize>> {
-    // Both ends, the smaller first, whether the side runs from the larger one, and the side.
+    // Smaller end, larger end, whether the side runs from the larger end, and the side.
     let mut sides: Vec<(u32, u32, bool, usize)> = Vec::with_capacity(3 * triangles.len());
     for (face, triangle) in triangles.iter().enumerate() {
         for at in 0..3 {
@@ -194,8 +180,8 @@ pub fn across(positions: &[Vec3], triangles: &[[u32; 3]]) -> Option<Vec<usize>> 
             pair(*one, *other);
             continue;
         }
-        // The sides in counter-clockwise order, as seen from the edge's larger end. A side from there begins a body, and a
-        // side towards it ends one.
+        // The sides in counter-clockwise order, as seen from the edge's larger end. A side from the larger end begins
+        // a body. A side towards the larger end closes it.
         let [from, to] = [edge[0].0, edge[0].1].map(|row| positions[row as usize]);
         let axis = (to - from).normalize_or(Vec3::Y);
         let x = axis.any_orthonormal_vector();
@@ -305,7 +291,7 @@ mod tests {
 
     #[test]
     fn an_edge_on_which_a_hole_has_closed_is_parted() {
-        // Two cubes touch along an edge between two full layers. Both its ends have one fan.
+        // Two cubes touch along an edge between two full layers. Each end of the edge has one fan.
         let (positions, triangles) = cubes(3, |[x, y, z]| x < 2 && z < 2 && (y != 1 || x == z));
         let found = check(&positions, &triangles, 1, 1);
         assert_eq!(found.triangles.len(), triangles.len() + 2);

@@ -5,13 +5,14 @@
 mod atlas;
 mod color;
 mod grid;
-mod join;
 mod manifold;
+mod parts;
 mod simplify;
 mod tunnels;
 mod views;
 
 use std::collections::HashMap;
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use burn::tensor::Tensor;
@@ -21,7 +22,7 @@ use rayon::prelude::*;
 use snapsnap_splat::scene::Loaded;
 use snapsnap_splat::{Gaussians, SplatError};
 
-use crate::mesh::Mesh;
+use crate::mesh::{Mesh, bytes};
 use color::Mean;
 use grid::{Grid, Kept};
 use views::{View, host};
@@ -32,14 +33,14 @@ const CUBES: f32 = 320.0;
 const MAX_CORNERS: f32 = 12e6;
 /// Side in pixels of the pictures for distances.
 const SIDE: u32 = 640;
-/// Side in pixels of the pictures for a texture, of which one at a time is in memory.
+/// Side in pixels of the pictures for a texture. Only one of these pictures is in memory at a time.
 const TEXTURE_SIDE: u32 = 1600;
-/// Largest distance from the surface that the field contains, in cubes.
+/// Truncation of the signed distances, in cubes.
 const TRUNCATION: f32 = 4.0;
 /// Largest distance between the inner and the outer side of one surface, in cubes.
 const THICKNESS: f32 = 2.0;
-/// Fewest views through a place that is outside. Gaps between the shells of front, back and sides are visible from few
-/// directions, the surroundings of a body from many.
+/// Smallest number of views that see through a point outside. Gaps between the shells of front, back and sides are
+/// visible from few directions, the surroundings of a body from many.
 const FREE_VIEWS: u8 = 3;
 /// Least opacity of the Gaussians that determine the body's box.
 const OPAQUE: f32 = 0.1;
@@ -47,21 +48,22 @@ const OPAQUE: f32 = 0.1;
 const FLYING: f32 = 0.002;
 /// Extent of a Gaussian around its centre, in standard deviations.
 const SEEN: f32 = 2.0;
-/// Number of times that neighbouring distances are averaged, against steps between views and the grain of Gaussians.
+/// Number of smoothing passes, against steps between views and the graininess of Gaussians.
 const SMOOTHED: usize = 2;
 /// Seconds on two cores that a scene may take without [`Options::force`]. A person takes half as long.
 const LONG: u32 = 20;
-/// Pairs of a splat and a tile in one of the views, and triangles before the reduction, that take about that time.
+/// Pairs of a splat and a tile in one view, and triangles before the reduction, that take about [`LONG`] seconds.
 const MAX_INTERSECTIONS: u64 = 20_000_000;
 const MAX_TRIANGLES: usize = 3_000_000;
 /// Fewest Gaussians of a body.
 const FEWEST: usize = 50;
-/// Least size of the box of the centres, as a share of the box of the Gaussians. Pictures of depth show the centres of Gaussians, so
-/// that a few large ones have no surface.
+/// Smallest size of the box of the centres, as a share of the box of the Gaussians. Depth maps show the centres of
+/// Gaussians, so that a few large Gaussians have no surface.
 const RESOLVED: f32 = 0.5;
-/// Distance of a body from the origin, in lengths of its box, beyond which its positions are measured from its middle: in f32 they would
-/// fall together.
-const FAR: f64 = 100.0;
+/// Accepted lengths of a body, metres, and its largest distance from the world's origin in lengths of its box. Beyond
+/// this distance, positions in f32 are too coarse for the cubes.
+const LENGTHS: RangeInclusive<f32> = 1e-3..=1e3;
+const FAR: f32 = 1000.0;
 
 /// Errors of [`fuse`].
 #[derive(Debug, thiserror::Error)]
@@ -75,6 +77,14 @@ pub enum FuseError {
     /// Too few Gaussians for the size of the body, or too large ones.
     #[error("no surface: the Gaussians are too large beside the distances between their centres")]
     Coarse,
+    /// A body that is far from a person's size or place.
+    #[error("no surface: a body of {length:.1e} m, {distance:.1e} m from the origin: scale or move it")]
+    Foreign {
+        /// Longest side of the body's box, metres.
+        length: f32,
+        /// Distance of the box's centre from the origin, metres.
+        distance: f32,
+    },
     /// Too much work.
     #[error("{0}: this would take longer than {LONG} s on a few cores")]
     Long(String),
@@ -106,40 +116,19 @@ impl Default for Options {
     }
 }
 
-/// A surface and counts of the steps that lead to it.
+/// A surface, and statistics of its fusion.
 #[derive(Debug, Clone)]
 pub struct Fused {
-    /// One closed piece, with a texture or a colour at each position; metres, measured from `offset`.
+    /// One closed piece in the Gaussians' world, with a texture or a colour at each position.
     pub mesh: Mesh,
-    /// Place of the mesh's origin in the Gaussians' world, metres. Zero unless the body is far from the world's origin.
-    pub offset: DVec3,
-    /// Connected gaps between the shells that were closed because too few views pass through them.
-    pub closed: usize,
-    /// Hollows inside that were filled.
-    pub filled: usize,
-    /// Walls across narrow tunnels through the body.
-    pub walls: usize,
-    /// Handles of the surface before the reduction, such as the ring of an arm whose hand is on the hip.
-    pub handles: usize,
     /// Parts apart from the body that were joined with it.
     pub joined: usize,
     /// Pieces beside the body that were dropped.
     pub dropped: usize,
-    /// Volume of the largest dropped piece, as a share of the body's.
+    /// Volume of the largest dropped piece, as a share of the body's volume.
     pub largest_dropped: f64,
     /// Triangles before the reduction.
     pub faces: usize,
-    /// Edge of the field's cubes, metres.
-    pub cell: f32,
-}
-
-impl Fused {
-    /// The mesh in the Gaussians' world, rounded to f32.
-    pub fn into_world(self) -> Mesh {
-        let Self { mut mesh, offset, .. } = self;
-        mesh.positions.iter_mut().for_each(|place| *place = (place.as_dvec3() + offset).as_vec3());
-        mesh
-    }
 }
 
 /// Makes a mesh of Gaussians. `stage` receives the name of each step.
@@ -147,9 +136,9 @@ impl Fused {
 /// # Errors
 /// [`FuseError`].
 pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fused, FuseError> {
-    let body = Placing::of(&scene.gaussians)?;
-    let scene = body.scene(scene);
-    let size = body.size;
+    let (centre, size) = body(&scene.gaussians)?;
+    // The surface is computed around the origin, where f32 is finest.
+    let scene = centred(scene, centre);
     let roomy = (size.element_product() / MAX_CORNERS).cbrt();
     let cell = (size.max_element() / CUBES).max(roomy);
     // The border stays outside.
@@ -175,11 +164,7 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     stage("distance field");
     let mut grid = Grid { origin: -0.5 * size - margin, cell, counts, values: Vec::new() };
     let rows = (0..counts.y * counts.z).into_par_iter();
-    let (values, gaps): (Vec<f32>, Vec<bool>) =
-        rows.flat_map_iter(|row| distances(&grid, row * counts.x, &views)).unzip();
-    grid.values = gaps.iter().map(|gap| if *gap { -1.0 } else { 1.0 }).collect();
-    let closed = grid.pieces().bodies();
-    grid.values = values;
+    grid.values = rows.flat_map_iter(|row| distances(&grid, row * counts.x, &views)).collect();
     (0..SMOOTHED).for_each(|_| grid.smooth());
     // A surface has about twice as many triangles as positions.
     let faces = 2 * grid.crossings();
@@ -190,8 +175,8 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
         )));
     }
     let joined = grid.join_parts();
-    let walls = grid.close_tunnels();
-    let Kept { dropped, filled, largest_dropped } = grid.keep_one_body();
+    grid.close_tunnels();
+    let Kept { dropped, largest_dropped } = grid.keep_one_body();
 
     stage("surface");
     let (positions, triangles) = grid.surface();
@@ -200,8 +185,6 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
         return Err(FuseError::Hollow);
     }
     let faces = triangles.len();
-    // Euler's formula for a closed surface of one piece.
-    let handles = (faces / 2 + 2).saturating_sub(positions.len()) / 2;
     let mut mesh = Mesh::colored(positions, Vec::new(), triangles);
     stage("colours");
     mesh.colors = color::colors(&mesh, &views, cell);
@@ -212,62 +195,21 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
         stage("texture");
         textured(&mut mesh, &scene, radius, options.texture, cell)?;
     }
-    let offset = body.offset();
-    mesh.positions.iter_mut().for_each(|place| *place = (body.world(*place) - offset).as_vec3());
-    let cell = (f64::from(cell) / body.scale) as f32;
-    Ok(Fused { mesh, offset, closed, filled, walls, handles, joined, dropped, largest_dropped, faces, cell })
+    mesh.positions.iter_mut().for_each(|place| *place += centre);
+    Ok(Fused { mesh, joined, dropped, largest_dropped, faces })
 }
 
-/// Place and size of a body. The surface is made around the origin, of a body one to two units long: f32 is finest there, and neither a
-/// figure of a micrometre nor one in the coordinates of a survey is lost.
-struct Placing {
-    /// Middle of the body's box, world metres.
-    centre: DVec3,
-    /// Units per metre, a power of two.
-    scale: f64,
-    /// Sides of the box, units.
-    size: Vec3,
+/// The Gaussians with `centre` at the origin.
+fn centred(scene: &Loaded, centre: Vec3) -> Loaded {
+    let mut scene = scene.clone();
+    let means = scene.gaussians.means.clone();
+    let centre = Tensor::<1>::from_floats(centre.to_array(), &means.device());
+    scene.gaussians.means = means - centre.unsqueeze::<2>();
+    scene
 }
 
-impl Placing {
-    fn of(gaussians: &Gaussians) -> Result<Self, FuseError> {
-        let (low, high) = bounds(gaussians)?;
-        let size = high - low;
-        if !(size.max_element() > 0.0 && size.is_finite()) {
-            return Err(FuseError::Hollow);
-        }
-        // The powers of two in both directions that f32 contains.
-        let scale = (-size.max_element().log2().floor()).clamp(-126.0, 126.0).exp2();
-        // Exact in f32, as the means are.
-        let centre = (0.5 * (low + high)).as_vec3().as_dvec3();
-        Ok(Self { centre, scale, size: (size * scale).as_vec3() })
-    }
-
-    /// The Gaussians in units around the origin.
-    fn scene(&self, scene: &Loaded) -> Loaded {
-        let Gaussians { means, scales, .. } = scene.gaussians.clone();
-        let centre = Tensor::<1>::from_floats(self.centre.as_vec3().to_array(), &means.device());
-        let means = (means - centre.unsqueeze::<2>()).mul_scalar(self.scale);
-        let scales = scales.mul_scalar(self.scale);
-        let mut scene = scene.clone();
-        scene.gaussians = Gaussians { means, scales, ..scene.gaussians };
-        scene
-    }
-
-    /// A place in the Gaussians' world, metres.
-    fn world(&self, place: Vec3) -> DVec3 {
-        place.as_dvec3() / self.scale + self.centre
-    }
-
-    /// The origin of the finished mesh in the Gaussians' world.
-    fn offset(&self) -> DVec3 {
-        let length = f64::from(self.size.max_element()) / self.scale;
-        if self.centre.length() > FAR * length { self.centre } else { DVec3::ZERO }
-    }
-}
-
-/// Replaces the colours of a mesh's positions by a texture, in which they remain at places that no view shows. The body is in
-/// the ball of this radius around the origin.
+/// Replaces the vertex colours by a texture. Texels that no view shows get the interpolated vertex colour. The body
+/// lies in the ball of this radius around the origin.
 fn textured(mesh: &mut Mesh, scene: &Loaded, radius: f64, side: usize, cell: f32) -> Result<(), FuseError> {
     let atlas = atlas::atlas(mesh, side).map_err(FuseError::Texture)?;
     let mut means = vec![Mean::default(); atlas.texels.len()];
@@ -278,12 +220,11 @@ fn textured(mesh: &mut Mesh, scene: &Loaded, radius: f64, side: usize, cell: f32
         });
     }
     let mut texture = vec![None; side * side];
-    let bytes = |color: Vec3| color.to_array().map(|c| (255.0 * c).round() as u8);
     for (mean, texel) in means.iter().zip(&atlas.texels) {
         texture[texel.at as usize] = Some(bytes(mean.color().unwrap_or(texel.color)));
     }
     atlas::spread(&mut texture, side);
-    // Filters do not reach the other texels.
+    // Filters do not reach the remaining texels.
     let background = bytes(mesh.colors.iter().sum::<Vec3>() / mesh.colors.len().max(1) as f32);
     let texture = texture.into_iter().flat_map(|color| color.unwrap_or(background)).collect();
     let texture = RgbImage::from_raw(side as u32, side as u32, texture).expect("three bytes for each texel");
@@ -303,40 +244,40 @@ fn textured(mesh: &mut Mesh, scene: &Loaded, radius: f64, side: usize, cell: f32
     Ok(())
 }
 
-/// Weighted mean of the distances of a place in the views.
+/// Weighted mean of a point's distances in the views.
 #[derive(Default, Clone, Copy)]
 struct Distance {
     sum: f32,
     weight: f32,
-    /// Views through the place.
+    /// Number of views that see through the point.
     free: u8,
 }
 
 impl Distance {
     /// Adds the distance and cosine of [`View::surface`].
     fn add(&mut self, (distance, facing): (f32, f32), reach: f32) {
-        // The view shows nothing behind the surface.
+        // A view shows nothing behind a surface.
         if distance < -reach {
             return;
         }
-        // From a distance along the ray to one along the normal.
+        // Converts the distance along the ray to the distance along the normal.
         let apart = (distance * facing).min(reach);
         self.sum += facing * apart;
         self.weight += facing;
         self.free = self.free.saturating_add(u8::from(apart >= reach));
     }
 
-    /// Signed distance from the surface, truncated, and whether the place is a gap between the shells.
-    fn finish(self, reach: f32) -> (f32, bool) {
+    /// Truncated signed distance from the surface. A gap between the shells counts as inside.
+    fn finish(self, reach: f32) -> f32 {
         let mean = if self.weight > 0.0 { self.sum / self.weight } else { -reach };
-        // Within reach of a surface its own distance decides.
-        let gap = mean >= 0.99 * reach && self.free < FREE_VIEWS;
-        (if gap { -reach } else { mean }, gap)
+        // Close to a surface, the distance decides.
+        let is_gap = mean >= 0.99 * reach && self.free < FREE_VIEWS;
+        if is_gap { -reach } else { mean }
     }
 }
 
 /// Distances of the row of corners along x that begins with `first`.
-fn distances(grid: &Grid, first: usize, views: &[View]) -> impl Iterator<Item = (f32, bool)> {
+fn distances(grid: &Grid, first: usize, views: &[View]) -> impl Iterator<Item = f32> {
     let reach = TRUNCATION * grid.cell;
     let start = grid.place(first);
     let mut distances = vec![Distance::default(); grid.counts.x];
@@ -352,8 +293,8 @@ fn distances(grid: &Grid, first: usize, views: &[View]) -> impl Iterator<Item = 
     distances.into_iter().map(move |distance| distance.finish(reach))
 }
 
-/// The box of the body's Gaussians, world metres.
-fn bounds(gaussians: &Gaussians) -> Result<(DVec3, DVec3), FuseError> {
+/// Centre and size of the box of the body's Gaussians, metres.
+fn body(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
     let opacities = host(gaussians.opacities.clone());
     let (means, scales) = (host(gaussians.means.clone()), host(gaussians.scales.clone()));
     let rows = means.as_chunks::<3>().0.iter().zip(scales.as_chunks::<3>().0);
@@ -382,7 +323,14 @@ fn bounds(gaussians: &Gaussians) -> Result<(DVec3, DVec3), FuseError> {
     if centres.max_element() < f64::from(RESOLVED) * size {
         return Err(FuseError::Coarse);
     }
-    // The Gaussians that were left out may be those of a hand.
+    // The Gaussians that were left out may belong to a hand.
     let margin = 0.06 * size;
-    Ok((low - margin, high + margin))
+    let (low, high) = (low - margin, high + margin);
+    let (centre, size) = ((0.5 * (low + high)).as_vec3(), (high - low).as_vec3());
+    let (length, distance) = (size.max_element(), centre.length());
+    if LENGTHS.contains(&length) && distance <= FAR * length {
+        Ok((centre, size))
+    } else {
+        Err(FuseError::Foreign { length, distance })
+    }
 }

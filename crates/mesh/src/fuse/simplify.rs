@@ -11,21 +11,21 @@ use crate::mesh::Mesh;
 
 /// Largest accepted error, as a share of the surface's size.
 const ERROR: f32 = 0.02;
-/// Error of the whole range of a colour, as a share of the surface's size.
+/// Error of a change over the whole range of a colour, as a share of the surface's size.
 const COLOR: f32 = 0.02;
 /// Width in edges of the rings around a neck that are kept.
 const RINGS: usize = 2;
 /// Most tries before the surface is returned as it is.
 const TRIES: usize = 40;
 
-/// Reduces a closed surface of one piece with colours to about `faces` triangles. The result is closed and one piece, too. 0
-/// keeps all triangles.
+/// Reduces a closed surface of one piece with vertex colours to about `faces` triangles; 0 keeps all. The result is
+/// closed and one piece, too.
 ///
-/// The library lets edges of thin places fall onto one another, which [`manifold`] repairs. If pieces come off, the next try
-/// keeps the necks at which they did, so that the result may have more triangles than `faces`.
+/// The library lets edges of thin parts coincide, which [`manifold`] repairs. If pieces come off, the next try keeps
+/// the necks at which they came off. The result may therefore have more triangles than `faces`.
 ///
 /// # Errors
-/// The library's, for a surface beyond its limits.
+/// The library's error for a surface beyond its limits.
 pub fn simplify(mut mesh: Mesh, faces: usize) -> Result<Mesh, Error> {
     if faces == 0 || mesh.faces.len() <= faces {
         return Ok(mesh);
@@ -77,14 +77,14 @@ fn reduce(mesh: &Mesh, triangles: &[[u32; 3]], kept: &[bool], faces: usize) -> R
     Ok(reduced.indices.as_chunks::<3>().0.to_vec())
 }
 
-/// For each position whether it is at a neck or in the rings around one. Necks are places at which the surface of these
-/// triangles came apart in the reduction; `None` if the reduced one is one piece.
+/// For each position whether it is at a neck or in the rings around a neck. At a neck, the reduction took the surface
+/// of `triangles` apart. `None` if the reduced surface is one piece.
 fn necks(triangles: &[[u32; 3]], positions: usize, reduced: &Manifold) -> Option<Vec<bool>> {
     let (piece, count) = reduced.pieces();
     if count <= 1 {
         return None;
     }
-    // Positions that are gone belong to the piece of the nearest one that is left. Necks are the places where pieces meet.
+    // Removed positions belong to the piece of the nearest remaining position. Necks are where pieces meet.
     let mut owner = vec![usize::MAX; positions];
     let mut neck = vec![false; positions];
     for (triangle, piece) in reduced.triangles.iter().zip(piece) {
@@ -181,7 +181,7 @@ mod tests {
         assert!((found / all - 1.0).abs() < within, "{found} instead of {all}");
     }
 
-    /// Thin fins on a plate, the sides of which fall onto one another.
+    /// Thin fins on a plate, whose sides coincide after a reduction.
     #[test]
     fn thin_places_stay_closed() {
         let box_of = |p: Vec3, half: Vec3| ((p - 24.0).abs() - half).max_element();
@@ -211,7 +211,7 @@ mod tests {
         }
     }
 
-    /// The two sides of a flat body fall onto one another.
+    /// The two sides of a flat body coincide after a reduction.
     #[test]
     fn a_flat_body_does_not_vanish() {
         let positions = vec![Vec3::ZERO, Vec3::X, Vec3::Y, 1e-3 * Vec3::Z];

@@ -1,5 +1,5 @@
-//! Tunnels through a body, such as a hole between the shells of a shoulder. Narrow ones are closed: the body grows and shrinks
-//! again (a morphological closing), and of what that adds only the walls across tunnels are kept.
+//! Closes narrow tunnels through a body, such as a hole between the shells of a shoulder. A morphological closing
+//! (dilation, then erosion) fills them; only the walls across tunnels are kept of it.
 
 use std::collections::VecDeque;
 use std::sync::LazyLock;
@@ -10,11 +10,11 @@ use super::grid::{Grid, STEPS};
 
 /// Width of the widest closed tunnel in cubes, 5 cm for a person of 1.7 m.
 const WIDEST: f32 = 8.0;
-/// Thickness that walls get on either side, in cubes.
+/// Thickness that is added to each side of a wall, in cubes.
 const THICKER: usize = 1;
 
-/// Bits of the 14 corners that share an edge with a corner, and the rows of their neighbours among themselves. The edges are those of
-/// Kuhn's subdivision, in which any corners that are neighbours in pairs form a simplex.
+/// The 14 corners that share an edge with a corner: their offsets, and bit sets of their neighbours among the 14. The
+/// edges are the edges of Kuhn's subdivision, in which corners that are neighbours in pairs form a simplex.
 static AROUND: LazyLock<[(I64Vec3, u16); 14]> = LazyLock::new(|| {
     let steps = STEPS.map(|step| I64Vec3::from_array(step.map(|s| s as i64)));
     let offsets: Vec<I64Vec3> = steps.into_iter().flat_map(|step| [step, -step]).collect();
@@ -27,7 +27,7 @@ static AROUND: LazyLock<[(I64Vec3, u16); 14]> = LazyLock::new(|| {
     })
 });
 
-/// Number of connected parts of some of the 14 corners.
+/// Number of connected components of a subset of the 14 corners.
 fn parts(mut corners: u16) -> u32 {
     let mut parts = 0;
     while corners != 0 {
@@ -45,19 +45,19 @@ fn parts(mut corners: u16) -> u32 {
     parts
 }
 
-/// For each set of the 14 corners whether it is connected.
+/// For each subset of the 14 corners whether it is connected.
 static CONNECTED: LazyLock<Vec<bool>> =
     LazyLock::new(|| (0..1_u16 << 14).map(|corners| parts(corners) == 1).collect());
 
 impl Grid {
-    /// Closes the tunnels through the inside that are narrower than [`WIDEST`]. Returns the number of walls.
-    pub fn close_tunnels(&mut self) -> usize {
+    /// Closes the tunnels through the inside that are narrower than [`WIDEST`].
+    pub fn close_tunnels(&mut self) {
         let inside: Vec<bool> = self.values.iter().map(|value| *value < 0.0).collect();
         let outside: Vec<bool> = self.spread(&inside).into_iter().map(|grown| !grown).collect();
         let outside = self.spread(&outside);
         let is_added = |row: usize| !outside[row] && !inside[row] && !self.on_border(row);
 
-        // What the closing added is taken away again from its surface, unless two parts of the outside would meet.
+        // Thinning: added corners are removed from the surface inwards, unless two parts of the outside would meet.
         let steps = AROUND.map(|(offset, _)| self.step(offset));
         let near = |row: usize| steps.map(|step| row.wrapping_add_signed(step));
         let link = |kept: &[bool], row: usize| {
@@ -74,10 +74,9 @@ impl Grid {
                 waiting.extend(near(row).into_iter().filter(|at| kept[*at] && is_added(*at)));
             }
         }
-        let walls: Vec<usize> = added.iter().copied().filter(|row| kept[*row]).collect();
 
         // Walls of one cube would be lost when the surface is reduced.
-        let mut front = walls.clone();
+        let mut front: Vec<usize> = added.iter().copied().filter(|row| kept[*row]).collect();
         for _ in 0..THICKER {
             let around: Vec<usize> = front.iter().flat_map(|row| near(*row)).collect();
             front.clear();
@@ -89,21 +88,18 @@ impl Grid {
                 }
             }
         }
-        let mut is_wall = vec![false; kept.len()];
         for row in added.into_iter().filter(|row| kept[*row]) {
-            is_wall[row] = true;
             self.values[row] = -0.5 * self.cell;
         }
-        self.count(&walls, &mut is_wall)
     }
 
-    /// Rows between a corner and another one at this offset.
+    /// Difference of indices for this offset.
     fn step(&self, offset: I64Vec3) -> isize {
         let strides = self.strides().map(|stride| stride as i64);
         offset.dot(I64Vec3::from_array(strides)) as isize
     }
 
-    /// Marks all corners within half of [`WIDEST`] of a marked one, by balls around those with an unmarked neighbour.
+    /// Dilation by half of [`WIDEST`]: balls around the marked corners that have an unmarked neighbour.
     fn spread(&self, marked: &[bool]) -> Vec<bool> {
         let reach = 0.5 * WIDEST;
         let side = reach as i64;
@@ -129,24 +125,6 @@ impl Grid {
             }
         }
         spread
-    }
-
-    /// Number of connected sets of marked corners that contain one of `rows`. Unmarks them.
-    fn count(&self, rows: &[usize], marked: &mut [bool]) -> usize {
-        let steps = AROUND.map(|(offset, _)| self.step(offset));
-        let (mut sets, mut waiting) = (0, Vec::new());
-        for row in rows {
-            if !std::mem::take(&mut marked[*row]) {
-                continue;
-            }
-            sets += 1;
-            waiting.push(*row);
-            while let Some(row) = waiting.pop() {
-                let near = steps.map(|step| row.wrapping_add_signed(step));
-                waiting.extend(near.into_iter().filter(|at| std::mem::take(&mut marked[*at])));
-            }
-        }
-        sets
     }
 }
 
@@ -180,16 +158,20 @@ mod tests {
         };
         let mut narrow = plate(&[1.2, 2.0]);
         let before = handles(&narrow);
-        assert_eq!((before.0, narrow.close_tunnels(), handles(&narrow).0), (2, 2, 0));
+        narrow.close_tunnels();
+        let after = handles(&narrow);
+        assert_eq!((before.0, after.0), (2, 0));
         // Walls are thin.
         let whole = handles(&plate(&[])).1;
-        assert!(handles(&narrow).1 < before.1 + 0.5 * (whole - before.1));
+        assert!(after.1 < before.1 + 0.5 * (whole - before.1));
         let mut wide = plate(&[6.0, 8.0]);
         let values = wide.values.clone();
-        assert_eq!((wide.close_tunnels(), handles(&wide).0), (0, 2));
+        wide.close_tunnels();
+        assert_eq!(handles(&wide).0, 2);
         assert_eq!(wide.values, values);
         let mut both = plate(&[6.0, 2.0]);
-        assert_eq!((both.close_tunnels(), handles(&both).0), (1, 1));
+        both.close_tunnels();
+        assert_eq!(handles(&both).0, 1);
     }
 
     #[test]
@@ -205,7 +187,7 @@ mod tests {
         });
         let values = scene.values.clone();
         assert_eq!(handles(&scene).0, 0);
-        assert_eq!((scene.close_tunnels(), handles(&scene).0), (0, 0));
+        scene.close_tunnels();
         assert_eq!(scene.values, values);
     }
 }

@@ -13,29 +13,29 @@ const RINGS: [(f64, usize); 7] =
 const DISTANCE: f64 = 4.0;
 /// Least coverage of a pixel that shows a surface.
 pub const COVERED: f32 = 0.5;
-/// Least cosine between a surface's normal and the ray. The pixels of flatter surfaces mix surfaces behind one another.
+/// Least cosine between a surface's normal and the ray. Pixels of more oblique surfaces mix several surfaces.
 const FLATTEST: f32 = 0.15;
-/// Side in pixels of the squares that are visible from inside as a whole or not at all.
+/// Side in pixels of the squares that are tested for the inner side as a whole.
 const SQUARE: usize = 2;
-/// Views of the other side of a surface for each view of this one, weighted by cosines, beyond which the other side is the outer one.
+/// Ratio of views of the other side to views of this side, weighted by cosines, from which this side is the inner one.
 const OTHER_SIDE: f32 = 2.0;
 
 /// View of one camera.
 pub struct View {
     camera: Camera,
-    /// Centre of the camera, in the units of [`super::Placing`], as all lengths here.
+    /// Centre of the camera, metres from the body's centre.
     centre: Vec3,
-    /// From the world to pixels times depth, and depth.
+    /// From the world to (x z, y z, z), with x and y in pixels and the depth z.
     projection: Mat4,
     /// Length along the optical axis; 0 at pixels without a surface.
     depth: Vec<f32>,
-    /// Cosine between the surface's normal and the ray; 0 where it is unknown, the surface too flat or seen from inside.
+    /// Cosine between normal and ray; 0 if the normal is unknown, the surface too oblique or seen from inside.
     facing: Vec<f32>,
     /// Red, green and blue in [0, 1], divided by the coverage.
     color: Vec<Vec3>,
 }
 
-/// Cameras around the ball of this radius around the origin, the whole of which is in each picture of `side`² pixels.
+/// Cameras around a ball at the origin. Each picture of `side`² pixels shows the whole ball.
 pub fn cameras(radius: f64, side: u32) -> Vec<Camera> {
     let distance = DISTANCE * radius;
     let focal = (distance * distance / (radius * radius) - 1.0).sqrt() * 0.5 * 0.98;
@@ -61,7 +61,7 @@ pub fn cameras(radius: f64, side: u32) -> Vec<Camera> {
 }
 
 impl View {
-    /// Renders Gaussians from one of the [`cameras`] around a ball of this radius. More than `max_intersections` pairs of a splat and a tile are refused.
+    /// Renders Gaussians from one of the [`cameras`]. Refuses more than `max_intersections` pairs of splat and tile.
     ///
     /// # Errors
     /// The errors of [`render`].
@@ -99,8 +99,8 @@ impl View {
         Ok(view)
     }
 
-    /// Place of the surface in a pixel and its normal towards the camera, metres in the camera's frame. `None` at the border of the
-    /// picture and of the surface.
+    /// Position and normal (towards the camera) of the surface in a pixel, metres in the camera's frame. `None` at
+    /// the border of the picture and of the surface.
     fn patch(&self, pixel: usize) -> Option<(Vec3, Vec3)> {
         let side = self.camera.width as usize;
         let (x, y) = (pixel % side, pixel / side);
@@ -120,19 +120,19 @@ impl View {
         Some((place, if normal.dot(place) > 0.0 { -normal } else { normal }))
     }
 
-    /// The pixel and the depth of a place.
+    /// Pixel and depth of a point.
     fn pixel(&self, place: Vec3) -> Option<(usize, f32)> {
         let p = self.projection.transform_point3(place);
         let (x, y) = (p.x / p.z, p.y / p.z);
         let side = self.camera.width as f32;
         let within = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < side && y < side;
-        // The conversion of numbers from 0 on rounds down.
+        // The conversion of non-negative numbers rounds down.
         within.then(|| (y as usize * self.camera.width as usize + x as usize, p.z))
     }
 
-    /// Distance in metres along the optical axis from a place to the surface behind it, and the cosine between the surface's
-    /// normal and the ray. The distance is negative for a surface before the place and infinite without one. `None` outside
-    /// of the picture, and where the picture cannot be trusted.
+    /// Distance in metres along the optical axis from a point to the surface in the view, and the cosine between the
+    /// surface's normal and the ray. The distance is negative for a surface in front of the point and infinite
+    /// without one. `None` outside of the picture and at pixels that cannot be trusted.
     pub fn surface(&self, place: Vec3) -> Option<(f32, f32)> {
         let (pixel, z) = self.pixel(place)?;
         match (self.depth[pixel], self.facing[pixel]) {
@@ -142,14 +142,14 @@ impl View {
         }
     }
 
-    /// Colour and cosine of the surface at a place, if one is within `reach` metres of it.
+    /// Colour and cosine of the surface at a point, if the surface is within `reach` metres of the point.
     pub fn color(&self, place: Vec3, reach: f32) -> Option<(Vec3, f32)> {
         let (pixel, z) = self.pixel(place)?;
         let (depth, facing) = (self.depth[pixel], self.facing[pixel]);
         (facing > 0.0 && (depth - z).abs() < reach).then(|| (self.color[pixel], facing))
     }
 
-    /// Unit vector from the camera to a place.
+    /// Unit vector from the camera to a point.
     pub fn towards(&self, place: Vec3) -> Vec3 {
         (place - self.centre).normalize()
     }
@@ -167,9 +167,9 @@ fn projection(camera: &Camera) -> Mat4 {
     DMat4::from(projection).as_mat4()
 }
 
-/// Marks pixels that show the inner side of a surface as not to be trusted. Level cameras do not see the top of a head. Through the hole
-/// there a camera above sees the far wall from inside, and what lies before that wall is not outside. The side that more views show is the
-/// outer one. `reach` is the largest distance between the two sides of one surface, metres.
+/// Marks pixels that show the inner side of a surface as not to be trusted. Level cameras do not see the top of a head.
+/// A camera above sees the far wall from inside through this hole, and the space before the wall is not outside. The
+/// outer side is visible in more views. `reach`: largest distance between both sides of a surface, metres.
 pub fn distrust_inner_sides(views: &mut [View], reach: f32) {
     let inner = |view: &View, pixel: usize| {
         let (place, normal) = view.patch(pixel)?;

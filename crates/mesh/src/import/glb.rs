@@ -1,5 +1,4 @@
-//! Binary glTF 2.0: every triangle of the default scene, in its node's place or where its joints put it, with its base
-//! colour.
+//! Reads binary glTF 2.0: all triangles of the default scene with their base colours, transformed by nodes or skins.
 
 use std::collections::HashSet;
 use std::fmt::Display;
@@ -14,7 +13,8 @@ use gltf::{Accessor, Document, Node, Primitive, image::Source};
 use image::RgbImage;
 use snapsnap_base::{FileError, file};
 
-use super::skin::{Bone, Rigged, Skins, Weights, moved};
+use super::rigged::{Bone, File, Place, Rigged, Skins};
+use super::skin::moved;
 use super::{MAX_BYTES, Textures, add_colors};
 use crate::mesh::{Face, Material, Mesh};
 use crate::picture::decode_bytes;
@@ -22,7 +22,7 @@ use crate::picture::decode_bytes;
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 256;
 
-/// Most positions and corners of faces that nodes and primitives may add by a further use of the same data.
+/// Largest number of positions and face corners that repeated uses of the same data may add.
 const MAX_ELEMENTS: usize = 4_000_000;
 
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
@@ -57,7 +57,7 @@ pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
     Ok(Rigged { mesh: file.mesh, bones: file.bones, weights: file.weights, has_animations })
 }
 
-/// Refuses references that are missing or out of range, on which the validation would panic.
+/// Refuses missing and out-of-range references, on which the validation of the `gltf` crate would panic.
 fn check_references(root: &Root) -> Result<(), String> {
     let accessors = root.accessors.len();
     for (mesh, value) in root.meshes.iter().enumerate() {
@@ -76,40 +76,7 @@ fn check_references(root: &Root) -> Result<(), String> {
     Ok(())
 }
 
-/// A primitive that a node shows.
-pub struct Place {
-    mesh: usize,
-    primitive: usize,
-    /// Row of the node in the bones.
-    node: usize,
-    pub skin: Option<usize>,
-}
-
-pub struct File<'a> {
-    path: &'a Path,
-    /// The binary part.
-    pub blob: Vec<u8>,
-    mesh: Mesh,
-    /// By the row of the image.
-    textures: Textures<usize>,
-    /// Nodes that may still be visited: each node of a tree is visited once, but a damaged file may contain loops.
-    nodes_left: usize,
-    pub places: Vec<Place>,
-    /// Accessors of the positions and corners of all entries of `places`.
-    shown: HashSet<usize>,
-    /// Positions and corners of data at their second and further places.
-    elements: usize,
-    bones: Vec<Bone>,
-    /// Index of the node of each bone, and its place in the world.
-    pub worlds: Vec<(usize, Mat4)>,
-    weights: Vec<Weights>,
-}
-
 impl File<'_> {
-    pub fn wrong(&self, problem: impl ToString) -> FileError {
-        FileError::unsuitable(self.path, problem)
-    }
-
     fn add(&mut self, document: &Document) -> Result<(), FileError> {
         for material in document.materials() {
             let material = self.material(&material)?;
@@ -122,7 +89,7 @@ impl File<'_> {
         for node in scene.nodes() {
             self.node(&node, None, 0)?;
         }
-        // The size of the whole is checked by now.
+        // The total size has been checked by now.
         let meshes = document.meshes().map(|mesh| mesh.primitives().collect());
         let primitives: Vec<Vec<Primitive>> = meshes.collect();
         let skins = self.skins(document)?;
@@ -136,7 +103,7 @@ impl File<'_> {
         let base = material.pbr_metallic_roughness();
         let [r, g, b, _] = base.base_color_factor();
         let texture = base.base_color_texture().map(|texture| self.texture(&texture.texture().source()));
-        // Factors are linear, colours of a mesh are sRGB.
+        // Factors are linear in glTF, colours of a mesh are sRGB.
         let color = Vec3::new(r, g, b).clamp(Vec3::ZERO, Vec3::ONE).map(shown);
         Ok(Material { color, texture: texture.transpose()? })
     }
@@ -171,7 +138,7 @@ impl File<'_> {
                         self.elements = self.elements.saturating_add(accessor.count());
                     }
                 }
-                // Primitives without data cost a little as well.
+                // A primitive without data counts as one element.
                 self.elements += 1;
                 if self.elements > MAX_ELEMENTS {
                     let message =
@@ -201,7 +168,7 @@ impl File<'_> {
             None if skins.is_empty() => Vec::new(),
             None => vec![[(place.node as u32, 1.0), (0, 0.0), (0, 0.0), (0, 0.0)]; count],
         };
-        // A skin replaces the place of its node.
+        // A skin replaces the transform of the node.
         let to_world = joints.map_or(self.worlds[place.node].1, |_| Mat4::IDENTITY);
         let reader = primitive.reader(|_| Some(&self.blob));
         let read = reader.read_positions().into_iter().flatten().map(Vec3::from_array);
@@ -215,7 +182,7 @@ impl File<'_> {
         let texcoords: Vec<Vec2> = reader
             .read_tex_coords(set)
             .into_iter()
-            // glTF's textures begin at the top.
+            // The origin of glTF's texture coordinates is at the top.
             .flat_map(|t| t.into_f32().map(|[u, v]| Vec2::new(u, 1.0 - v)))
             .collect();
         let colors: Vec<Vec3> = reader
@@ -234,7 +201,7 @@ impl File<'_> {
         let first_texcoord = self.mesh.texcoords.len() as u32;
         let rows = indices.unwrap_or_else(|| (0..positions.len() as u32).collect());
         let material = primitive.material().index().unwrap_or(self.mesh.materials.len() - 1) as u32;
-        // A mirrored node turns its triangles inside out.
+        // A node that mirrors turns its triangles inside out.
         let mirrored = to_world.determinant() < 0.0;
         let triangles = rows.len().saturating_sub(2);
         let triangle = |i: usize| match mode {
@@ -264,7 +231,7 @@ impl File<'_> {
         Ok(())
     }
 
-    /// Refuses the accessors of a primitive as [`File::check`] does.
+    /// Checks the accessors of a primitive with [`File::check`].
     fn check_accessors(&self, primitive: &Primitive) -> Result<(), FileError> {
         let shares: &[DataType] = &[DataType::U8, DataType::U16, DataType::F32];
         let texcoords = gltf::Semantic::TexCoords(texture_set(primitive));
@@ -280,46 +247,9 @@ impl File<'_> {
         let rows = [DataType::U8, DataType::U16, DataType::U32];
         self.check("indices", primitive.indices(), &rows, &[Dimensions::Scalar])
     }
-
-    /// Refuses an accessor of a wrong type or outside the file: the reader does not check it.
-    pub fn check(
-        &self,
-        name: &str,
-        accessor: Option<Accessor>,
-        types: &[DataType],
-        dimensions: &[Dimensions],
-    ) -> Result<(), FileError> {
-        let Some(accessor) = accessor else { return Ok(()) };
-        let index = accessor.index();
-        if !types.contains(&accessor.data_type()) || !dimensions.contains(&accessor.dimensions()) {
-            let found = format!("{:?} of {:?}", accessor.dimensions(), accessor.data_type());
-            return Err(self.wrong(format!("accessor {index} holds {name}, but as {found}")));
-        }
-        if accessor.sparse().is_some() {
-            return Err(self.wrong(format!("accessor {index} is sparse, which scans are not")));
-        }
-        let view = accessor.view().ok_or_else(|| self.wrong(format!("accessor {index} has no data")))?;
-        let size = accessor.size();
-        let stride = view.stride().unwrap_or(size);
-        let end = accessor
-            .count()
-            .checked_sub(1)
-            .and_then(|last| last.checked_mul(stride)?.checked_add(size)?.checked_add(accessor.offset()));
-        let inside = view.offset().checked_add(view.length()).is_some_and(|end| end <= self.blob.len());
-        if stride < size || !inside || end.is_none_or(|end| end > view.length()) {
-            let count = accessor.count();
-            return Err(self.wrong(format!(
-                "accessor {index} promises {count} entries, more than the file holds; it may be cut off"
-            )));
-        }
-        if view.buffer().index() != 0 {
-            return Err(self.wrong(format!("accessor {index} lies outside the file")));
-        }
-        Ok(())
-    }
 }
 
-/// Number of the texture coordinates that belong to the primitive's texture.
+/// Index of the set of texture coordinates that the primitive's texture uses.
 fn texture_set(primitive: &Primitive) -> u32 {
     let base = primitive.material().pbr_metallic_roughness();
     base.base_color_texture().map_or(0, |texture| texture.tex_coord())

@@ -3,6 +3,7 @@
 mod glb;
 mod obj;
 mod ply;
+mod rigged;
 mod skin;
 #[cfg(test)]
 mod tests;
@@ -18,21 +19,21 @@ use snapsnap_base::{FileError, guarded, quoted};
 
 use crate::mesh::Mesh;
 use crate::picture::decode;
-pub use skin::{Bone, Rigged, Weights};
+pub use rigged::{Bone, Rigged, Weights};
 
-/// Endings of the files that [`read`] accepts, in lower case.
+/// File extensions that [`read`] accepts, in lower case.
 pub const EXTENSIONS: [&str; 3] = ["obj", "ply", "glb"];
 
 /// Largest file that is read; the largest published scans take a few hundred megabytes.
 const MAX_BYTES: u64 = 4 << 30;
 
-/// Bytes that a decoded texture may take: 8192×8192 pixels of red, green, blue and alpha in 16 bits each.
+/// Memory limit of a decoded texture in bytes: 8192×8192 RGBA pixels of 16 bits per channel.
 const MAX_TEXTURE: u64 = 512 << 20;
-/// The same for all textures of a scan, as red, green and blue.
+/// Memory limit of all textures of a scan in bytes, as 8-bit RGB.
 const MAX_TEXTURES: u64 = 1 << 30;
 
-/// Reads a scan. Positions are as in the file. Equal positions become one, so that shading is smooth across the seams of
-/// textures.
+/// Reads a scan. Positions are as in the file. Equal positions are merged, so that shading is smooth across texture
+/// seams.
 ///
 /// # Errors
 /// [`FileError`] for a file or texture that is missing, damaged, too large or in another format, and for a mesh that
@@ -50,10 +51,10 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     Ok(mesh)
 }
 
-/// Reads a GLB with its skeleton, as [`read`] reads its mesh.
+/// Reads a GLB with its skeleton. The mesh is as [`read`] returns it.
 ///
 /// # Errors
-/// As [`read`]; for joints and weights that are missing or damaged, naming the position.
+/// As [`read`], and for joints or weights that are missing or damaged. The error names the position.
 pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
     let mut rigged = guarded(path, || glb::read_rigged(path))?;
     let kept = finish(&mut rigged.mesh, path)?;
@@ -61,7 +62,7 @@ pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
     Ok(rigged)
 }
 
-/// Checks a mesh, brings its colours into [0, 1], and merges equal positions. Returns the former rows of the positions.
+/// Checks a mesh, brings its colours into [0, 1] and merges equal positions. Returns the former index of each.
 fn finish(mesh: &mut Mesh, path: &Path) -> Result<Vec<usize>, FileError> {
     mesh.check().map_err(|e| FileError::unsuitable(path, e))?;
     // The brightest value of a colour is 1 in some files and 255 in others.
@@ -72,7 +73,7 @@ fn finish(mesh: &mut Mesh, path: &Path) -> Result<Vec<usize>, FileError> {
     Ok(mesh.weld())
 }
 
-/// Adds the colours of the positions from row `first` on. Positions without a colour become white if others have one.
+/// Adds the vertex colours from index `first` on. If some vertices have a colour, the others become white.
 fn add_colors(mesh: &mut Mesh, first: usize, colors: impl ExactSizeIterator<Item = Vec3>) {
     if colors.len() > 0 || !mesh.colors.is_empty() {
         mesh.colors.resize(first, Vec3::ONE);
@@ -93,7 +94,7 @@ impl<K: Eq + Hash> Textures<K> {
         Self { loaded: HashMap::new(), left: MAX_TEXTURES }
     }
 
-    /// The texture of this key. `decode` receives the number of bytes that the texture may take.
+    /// The texture with this key. `decode` is called at the first use and receives the memory limit in bytes.
     fn load(
         &mut self,
         key: K,
@@ -124,7 +125,7 @@ impl Textures<PathBuf> {
     }
 }
 
-/// The existing file to which `owner` refers as `name`: relative to the folder of `owner`, or else of that name in the
+/// The file to which `owner` refers as `name`: relative to the folder of `owner`, or else the file name alone in this
 /// folder, since scans contain paths of other machines.
 fn beside(owner: &Path, kind: &str, name: &str) -> Result<PathBuf, FileError> {
     let folder = owner.parent().unwrap_or(Path::new(""));

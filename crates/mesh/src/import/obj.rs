@@ -13,7 +13,7 @@ use crate::mesh::{Face, Material, Mesh};
 
 /// Longest line in bytes.
 const MAX_LINE: usize = 1 << 20;
-/// Largest share of vertices at the end of a file that belong to no face.
+/// Largest share of vertices at the end of a file that no face uses.
 const UNUSED: f64 = 0.05;
 
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
@@ -35,7 +35,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         read_materials(&file).map_err(fail)
     });
     let (models, materials) = loaded.map_err(|e| {
-        // Faults of the whole file count as faults of its last line.
+        // Errors about the whole file name its last line.
         let lines = text[..text.len() - rest.len()].lines().count();
         wrong(format!("line {}: {e}", lines.max(1)))
     })?;
@@ -44,7 +44,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     }
     check_whole(&text).map_err(wrong)?;
     let materials = materials.unwrap_or_default();
-    // The parser ignores unknown names.
+    // The parser ignores unknown names of materials.
     let mut used = text.lines().filter_map(|line| line.strip_prefix("usemtl ")).map(str::trim);
     let known = |name: &&str| materials.is_empty() || materials.iter().any(|m| m.name == **name);
     if let Some(name) = used.find(|name| !known(name)) {
@@ -83,7 +83,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     Ok(mesh)
 }
 
-/// Refuses a file that was cut short. Its signs are:
+/// Refuses a truncated file. Signs of truncation are:
 /// * a last line without a line break,
 /// * a face of fewer than three corners, which the parser takes for a line,
 /// * many vertices at the end that belong to no face,
@@ -101,7 +101,7 @@ fn check_whole(text: &str) -> Result<(), String> {
                 for word in words {
                     corners += 1;
                     let row: i64 = word.split('/').next().and_then(|row| row.parse().ok()).unwrap_or(0);
-                    // Negative numbers count from the end.
+                    // Negative indices count from the end.
                     last = last.max(if row < 0 { counts.vertices + row + 1 } else { row });
                 }
                 if kind == "f" && corners < 3 {
@@ -136,22 +136,22 @@ fn check_whole(text: &str) -> Result<(), String> {
     Ok(())
 }
 
-/// Counts of an OBJ's statements, and the counts in its comments.
+/// Numbers of an OBJ's statements, and the numbers that its comments promise.
 #[derive(Default)]
 struct Counts {
     vertices: i64,
     faces: i64,
     triangles: i64,
-    /// Numbers and nouns of the comments before the first vertex and the first face.
+    /// Number and noun of each counting comment before the first vertex and face.
     promised: Vec<(i64, &'static str)>,
     /// Whether a comment counts points.
     has_points: bool,
 }
 
 impl Counts {
-    /// Notes a comment that contains only a count, as exporters write them: `# Vertices: 8`, `# 12 faces`,
-    /// `# number of triangles: 12`, `#Vertex Count 8`. Comments behind the first vertex or face count the statements
-    /// before them and are ignored.
+    /// Records a comment that contains only a count, as exporters write it: `# Vertices: 8`, `# 12 faces`, `# number
+    /// of triangles: 12`, `#Vertex Count 8`. Comments after the first vertex or face count the preceding statements
+    /// and are ignored.
     fn comment(&mut self, line: &str) {
         let Some(comment) = line.trim_start().strip_prefix('#') else { return };
         if self.vertices + self.faces > 0 || comment.len() > 80 {
@@ -194,7 +194,7 @@ impl Counts {
     }
 }
 
-/// The file in a `map_Kd` statement, behind its options (`-s 1 1 1 skin.png`).
+/// The file in a `map_Kd` statement, after its options (`-s 1 1 1 skin.png`).
 fn file_name(statement: &str) -> &str {
     let is_number = |text| first_word(text).0.parse::<f32>().is_ok();
     let mut rest = statement.trim();
@@ -213,18 +213,18 @@ fn file_name(statement: &str) -> &str {
     rest
 }
 
-/// The first word, and the text behind it.
+/// The first word, and the text after it.
 fn first_word(text: &str) -> (&str, &str) {
     text.split_once(char::is_whitespace).map_or((text, ""), |(word, rest)| (word, rest.trim_start()))
 }
 
-/// A text file. Bytes that are no UTF-8 are replaced.
+/// Reads a text file. Invalid UTF-8 is replaced.
 fn read_lossy(path: &Path) -> Result<String, FileError> {
     let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
     Ok(String::from_utf8(bytes).unwrap_or_else(|e| String::from_utf8_lossy(e.as_bytes()).into_owned()))
 }
 
-/// Names, colours and textures of materials. The reader in `tobj` fails on damaged files.
+/// Reads names, colours and textures of materials. The reader in `tobj` fails on damaged files.
 fn read_materials(path: &Path) -> Result<(Vec<tobj::Material>, HashMap<String, usize>), FileError> {
     let text = read_lossy(path)?;
     let mut materials: Vec<tobj::Material> = Vec::new();

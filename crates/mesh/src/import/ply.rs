@@ -32,7 +32,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         match element.name.as_str() {
             "vertex" => vertices(element, &mut body, &mut mesh),
             "face" => faces(element, &mut body, &mut mesh),
-            // Rows without properties take no room in the file.
+            // Elements without properties have no bytes in the file.
             _ if element.properties.is_empty() => Ok(()),
             _ => (0..element.count).try_for_each(|row| {
                 let skip =
@@ -49,13 +49,13 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     Ok(mesh)
 }
 
-/// Values behind the header.
+/// The values after the header.
 enum Body<'a> {
     Text(SplitAsciiWhitespace<'a>),
     Binary { bytes: &'a [u8], big: bool },
 }
 
-/// The next value of a binary body, lowest byte first; only its type's bytes count.
+/// The next value of a binary body in little-endian order, padded with zeros to eight bytes.
 fn take(bytes: &mut &[u8], kind: Scalar, big: bool) -> Option<[u8; 8]> {
     let (value, rest) = bytes.split_at_checked(kind.size())?;
     *bytes = rest;
@@ -68,7 +68,7 @@ fn take(bytes: &mut &[u8], kind: Scalar, big: bool) -> Option<[u8; 8]> {
 }
 
 impl Body<'_> {
-    /// The next value as a number; `None` at the end and for text that is none.
+    /// The next value as a number; `None` at the end and for text that is no number.
     fn number(&mut self, kind: Scalar) -> Option<f32> {
         match self {
             Self::Text(words) => words.next()?.parse().ok(),
@@ -76,7 +76,7 @@ impl Body<'_> {
         }
     }
 
-    /// The next value as a length or a row.
+    /// The next value as a length or an index.
     fn count(&mut self, kind: Scalar) -> Option<usize> {
         match self {
             Self::Text(words) => words.next()?.parse().ok(),
@@ -85,8 +85,8 @@ impl Body<'_> {
     }
 }
 
-/// Reads one row of an element. `value` reads the next value of the property in this column; it returns `None` for a value
-/// that is missing or no number.
+/// Reads one row of an element. `value` receives the index of a property and reads its next value. It returns `None`
+/// for a value that is missing or no number.
 ///
 /// # Errors
 /// A missing or wrong value, or a list of more than `longest` values.
@@ -115,7 +115,7 @@ fn read_row(
     Ok(())
 }
 
-/// Columns by one of the names that exporters give them.
+/// Index of the property that has one of these names of different exporters.
 fn column(element: &Element, names: &[&str]) -> Option<usize> {
     element.properties.iter().position(|p| p.list.is_none() && names.contains(&p.name.as_str()))
 }
@@ -182,7 +182,7 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), Stri
         if per_corner {
             mesh.texcoords.extend(texcoords.chunks_exact(2).map(Vec2::from_slice));
         }
-        // A fan; fewer than three corners are no face.
+        // A fan of triangles. Fewer than three corners give none.
         for i in 1..corners.len().saturating_sub(1) {
             let positions = [corners[0], corners[i], corners[i + 1]];
             let texcoords = if per_vertex {

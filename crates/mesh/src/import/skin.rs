@@ -1,4 +1,4 @@
-//! Skins of binary glTF: positions moved by the joints, and the skeleton for other poses.
+//! Skins of binary glTF: linear blend skinning, and the skeleton for other poses.
 
 use std::collections::HashMap;
 
@@ -7,46 +7,13 @@ use gltf::accessor::{DataType, Dimensions};
 use gltf::{Document, Primitive, Semantic};
 use snapsnap_base::FileError;
 
-use super::glb::File;
-use crate::mesh::Mesh;
+use super::rigged::{BONES, File, Skins, Weights};
 
 /// Largest deviation of the sum of a position's weights from 1.
 const LARGEST_ERROR: f32 = 0.02;
-/// Bones of a position.
-const BONES: usize = 4;
-
-/// Bones that move a position, with shares that add up to 1.
-pub type Weights = [(u32, f32); BONES];
-
-/// A node of the skeleton, as the file's nodes place it.
-#[derive(Debug, Clone)]
-pub struct Bone {
-    /// Its name; empty without one.
-    pub name: String,
-    /// Row of its parent, which comes before it.
-    pub parent: Option<usize>,
-    /// Its origin, in the positions' space.
-    pub place: Vec3,
-}
-
-/// A mesh and what moves it.
-#[derive(Debug, Clone, Default)]
-pub struct Rigged {
-    /// The mesh in the pose of the file's nodes.
-    pub mesh: Mesh,
-    /// All nodes of the scene, parents before children.
-    pub bones: Vec<Bone>,
-    /// By position. A mesh without a skin follows its node. Empty if the file has no skin.
-    pub weights: Vec<Weights>,
-    /// Whether the file has morph targets or animations, which are ignored.
-    pub has_animations: bool,
-}
-
-/// The joints of all skins: row of the bone, and the matrix from the mesh's space to the world.
-pub type Skins = Vec<Vec<(u32, Mat4)>>;
 
 impl File<'_> {
-    /// The joints of all skins, from the places of their nodes in the world.
+    /// The joints of all skins, from the world transforms of their nodes.
     ///
     /// # Errors
     /// A joint outside of the scene, or inverse bind matrices that are missing or damaged.
@@ -92,7 +59,7 @@ impl File<'_> {
         skins.collect()
     }
 
-    /// Weights of a primitive's positions; bones are rows of `joints`.
+    /// Skin weights of a primitive's positions, with bones as indices into `joints`.
     ///
     /// # Errors
     /// Missing or damaged weights, naming the position.
@@ -143,7 +110,7 @@ impl File<'_> {
     }
 }
 
-/// The position that the joints give.
+/// A position after linear blend skinning.
 pub fn moved(p: Vec3, weights: &Weights, joints: &[(u32, Mat4)]) -> Vec3 {
     weights
         .iter()

@@ -3,13 +3,13 @@
 use image::error::{DecodingError, ImageFormatHint};
 use image::{DynamicImage, ImageError, RgbImage, RgbaImage};
 
-/// Length of the part of a file that shows its kind.
+/// Bytes at the start of a file that identify its format.
 pub const START: usize = 12;
 /// Brands of still pictures in HEVC (ISO/IEC 23008-12, annex B).
 const BRANDS: [&[u8; 4]; 6] = [b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1"];
-/// Bytes per pixel while a picture is decoded: 13, measured on one of 12 million pixels, and some to spare.
+/// Peak bytes per pixel of the decoder: 13, measured on a picture of 12 million pixels, plus a reserve.
 const BYTES_PER_PIXEL: u64 = 16;
-/// Most pixels per byte of a file. A picture of one colour has some 10,000.
+/// Largest number of pixels per byte of file. A picture of one colour has about 10,000.
 const MAX_PIXELS_PER_BYTE: u64 = 1 << 15;
 
 /// Whether a file begins as a HEIC does.
@@ -22,13 +22,13 @@ fn damaged(message: impl ToString) -> ImageError {
     ImageError::Decoding(DecodingError::new(hint, message.to_string()))
 }
 
-/// Width and height of the picture, upright, and the bytes that decoding takes at most.
+/// Width and height of the upright picture, and the largest number of bytes that decoding takes.
 pub fn size(bytes: &[u8]) -> Result<([u32; 2], u64), ImageError> {
     let info = heic_decoder::probe(bytes).map_err(damaged)?;
     let side = |length: usize| u32::try_from(length).map_err(damaged);
     let mut pixels = (info.coded_width as u64).saturating_mul(info.coded_height as u64);
     if contains(bytes, b"grid") {
-        // Tiles may be larger than the picture that is cut out of them. Each is one of the file's items.
+        // Tiles may be larger than the picture, which is cropped from them. Each tile is one item of the file.
         let items = places(bytes, b"hvc1").count() as u64;
         let largest = places(bytes, b"hvcC").filter_map(|at| coded_pixels(&bytes[at + 4..])).max();
         pixels = pixels.max(items.saturating_mul(largest.unwrap_or(0)));
@@ -48,7 +48,7 @@ fn contains(bytes: &[u8], kind: &[u8; 4]) -> bool {
     places(bytes, kind).next().is_some()
 }
 
-/// Pixels of a picture, from the sequence parameter set in a decoder's configuration (ISO/IEC 14496-15, 8.3.2.1; ITU-T H.265, 7.3.2.2).
+/// Coded pixels, from the sequence parameter set of a configuration (ISO/IEC 14496-15, 8.3.2.1; H.265, 7.3.2.2).
 fn coded_pixels(configuration: &[u8]) -> Option<u64> {
     const SEQUENCE: u8 = 33;
     let length = |at: usize| {
@@ -77,7 +77,7 @@ struct Bits {
 }
 
 impl Bits {
-    /// The bytes behind the header of two, without those that only keep start codes from appearing (H.265, 7.3.1.1).
+    /// The payload after the two header bytes, without the bytes that prevent start codes (H.265, 7.3.1.1).
     fn of(unit: &[u8]) -> Self {
         let mut bytes: Vec<u8> = Vec::with_capacity(unit.len());
         let mut zeros = 0;
@@ -102,7 +102,7 @@ impl Bits {
         (0..bits).try_fold(0, |number, _| Some(number << 1 | self.bit()?))
     }
 
-    /// An unsigned number in the code of Exp-Golomb (H.265, 9.2).
+    /// An unsigned Exp-Golomb number (H.265, 9.2).
     fn golomb(&mut self) -> Option<u64> {
         let mut zeros = 0;
         while self.bit()? == 0 {
@@ -114,7 +114,7 @@ impl Bits {
     fn pixels(mut self) -> Option<u64> {
         self.number(4)?;
         let layers = self.number(3)?;
-        // Nesting, then the general profile and level.
+        // Skips the nesting flag, then the general profile and level.
         self.at += 1 + 96;
         let mut skipped = 0;
         if layers > 0 {

@@ -1,4 +1,4 @@
-//! Strict decoding of JPEG files. The decoder of the image crate fills the missing part of a file that was cut short with grey.
+//! Strict decoding of JPEG files. The image crate's decoder fills the missing part of a truncated file with grey.
 
 use image::error::{DecodingError, ImageFormatHint};
 use image::metadata::Orientation;
@@ -8,7 +8,7 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-/// Most pixels per byte of a JPEG: each block of 8×8 takes one bit at least.
+/// Largest number of pixels per byte of a JPEG: each 8×8 block takes at least one bit.
 const MAX_PIXELS_PER_BYTE: u64 = 512;
 
 /// A JPEG whose header has been read.
@@ -34,7 +34,7 @@ impl<'a> Jpeg<'a> {
         let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
         decoder.decode_headers().map_err(|e| damaged(format!("{e:?}")))?;
         let (width, height) = decoder.dimensions().ok_or_else(|| damaged("its size is missing"))?;
-        // The limit keeps a few bytes from taking gigabytes.
+        // Otherwise a file of a few bytes could claim gigabytes.
         if (width * height) as u64 > MAX_PIXELS_PER_BYTE * bytes.len() as u64 || !is_whole(bytes) {
             return Err(damaged("the file ends before the picture does"));
         }
@@ -60,11 +60,11 @@ impl<'a> Jpeg<'a> {
     }
 }
 
-/// Whether the segments of a JPEG lead to an end-of-image marker (ITU T.81, B.1.1). Pictures within segments (thumbnails) do
-/// not count.
+/// Whether the segments of a JPEG lead to an end-of-image marker (ITU T.81, B.1.1). Thumbnails inside segments do not
+/// count.
 fn is_whole(bytes: &[u8]) -> bool {
     let mut at = 0;
-    // Behind 0xFF and possible padding is the marker, which is followed by the segment's length in most cases.
+    // A marker follows 0xFF and optional padding. The length of the segment follows most markers.
     while let Some(found) = bytes[at..].windows(2).position(|pair| pair[0] == 0xff && is_marker(pair[1])) {
         let marker = bytes[at + found + 1];
         at += found + 2;
@@ -84,7 +84,7 @@ fn is_whole(bytes: &[u8]) -> bool {
     false
 }
 
-/// Whether the byte behind 0xFF is a marker: 0 marks coded data, and 0xFF is padding.
+/// Whether the byte after 0xFF is a marker. 0 means coded data, 0xFF means padding.
 fn is_marker(byte: u8) -> bool {
     byte != 0 && byte != 0xff
 }

@@ -102,7 +102,7 @@ fn heic_pictures_are_read_and_damaged_ones_refused() {
         let error = decode(&path, MAX_BYTES).map(|_| ()).expect_err("cut").to_string();
         assert!(error.contains("not a readable image") && error.contains("a.heic"), "{length}: {error}");
     }
-    // In a grid each item may have the size of the bitstream: 96×64 here, as the file has no grid.
+    // Without a grid the coded size counts once, with a grid once for each item.
     assert_eq!(heic::size(HEIC).expect("a size"), ([96, 64], 16 * 96 * 64));
     let more = [HEIC, b"grid", &b"hvc1".repeat(40)].concat();
     let items = more.windows(4).filter(|kind| *kind == b"hvc1").count() as u64;

@@ -1,10 +1,15 @@
-//! Lights: soft ones without shadows, and surroundings whose light is partly hidden by the mesh itself.
+//! Lights: soft directional lights without shadows, and surroundings with shadows cast by the mesh itself.
 
 use std::f32::consts::{PI, TAU};
 
 use glam::{Mat3, Vec3};
 
-use super::occlusion::{SHARE, ways};
+/// Number of pairs of opposite directions from which light is summed.
+pub const PAIRS: usize = 96;
+/// Number of directions.
+pub const WAYS: usize = 2 * PAIRS;
+/// Weight of one direction: light of 1 from all directions is reflected as 1.
+pub const SHARE: f32 = 4.0 / WAYS as f32;
 
 /// The light in a view.
 #[derive(Debug, Clone)]
@@ -21,18 +26,18 @@ impl Default for Light {
     }
 }
 
-/// Soft directional lights. Together they are so strong that the brightest direction reflects exactly the surface's own
-/// colour, and none is clipped.
+/// Soft directional lights, scaled so that a surface in the brightest direction shows exactly its own colour. No
+/// surface is clipped.
 #[derive(Debug, Clone)]
 pub struct Lights {
-    /// Unit vectors towards the lights, world axes, and their strengths.
+    /// Unit vector towards each light in world axes, and its strength.
     directional: Vec<(Vec3, f32)>,
-    /// Light from everywhere.
+    /// Ambient light.
     ambient: f32,
 }
 
 impl Lights {
-    /// Scales these directions with strengths, and the light from everywhere, as a whole.
+    /// Lights of these directions and strengths, and ambient light, all scaled by one factor.
     pub fn new(directional: &[(Vec3, f32)], ambient: f32) -> Self {
         let directional = directional.iter().map(|(d, s)| (d.normalize_or_zero(), *s)).collect();
         let mut lights = Self { directional, ambient };
@@ -44,13 +49,13 @@ impl Lights {
 
     /// Light that a surface with this unit normal reflects, 0 to 1.
     pub fn strength(&self, normal: Vec3) -> f32 {
-        // A direction between the sampled ones may be brighter, by less than a shade of 8 bits.
+        // A direction between the sampled ones may be brighter by less than one step of 8 bits.
         self.sum(normal).min(1.0)
     }
 
     fn sum(&self, normal: Vec3) -> f32 {
         let soft = |(direction, strength): &(Vec3, f32)| {
-            // Light from an area reaches a little beyond the terminator.
+            // The light of an area reaches a little beyond the terminator.
             let cosine = (normal.dot(*direction) + 0.3) / 1.3;
             strength * cosine.max(0.0)
         };
@@ -59,7 +64,7 @@ impl Lights {
 }
 
 impl Default for Lights {
-    /// Six weak lights all around, from above, and one stronger.
+    /// Six weak lights all around, from above, and a stronger one.
     fn default() -> Self {
         let mut directional: Vec<(Vec3, f32)> = (0..6)
             .map(|i| {
@@ -72,8 +77,8 @@ impl Default for Lights {
     }
 }
 
-/// Unit vectors, evenly spread over the sphere, from the top down.
-pub(super) fn directions(count: usize) -> impl Iterator<Item = Vec3> {
+/// Unit vectors of a Fibonacci lattice on the sphere, from the top down.
+fn directions(count: usize) -> impl Iterator<Item = Vec3> {
     let golden = TAU * (1.0 - 1.0 / 1.618_034);
     (0..count).map(move |i| {
         let y = 1.0 - (2 * i + 1) as f32 / count as f32;
@@ -83,19 +88,29 @@ pub(super) fn directions(count: usize) -> impl Iterator<Item = Vec3> {
     })
 }
 
-/// An area that shines, far away.
+/// The directions from which light is summed. The second half are the opposites of the first, in the same order.
+pub fn ways() -> [Vec3; WAYS] {
+    let mut ways = [Vec3::ZERO; WAYS];
+    // The upper hemisphere of an even distribution.
+    for (i, way) in directions(WAYS).take(PAIRS).enumerate() {
+        (ways[i], ways[i + PAIRS]) = (way, -way);
+    }
+    ways
+}
+
+/// A distant area light.
 #[derive(Debug, Clone, Copy)]
 pub struct Lamp {
     /// Unit vector towards it.
     pub direction: Vec3,
-    /// Its light, linear.
+    /// Linear red, green and blue of its light.
     pub color: Vec3,
-    /// Half of its width as an angle: its light falls to 1/e there, radians.
+    /// Angular radius in radians, at which the light falls to 1/e.
     pub radius: f32,
 }
 
-/// Light from all around: lamps, and a sky that is brighter above than below. The brightest direction of a surface
-/// without shadows reflects exactly the surface's own colour.
+/// Light from all around: lamps, and a sky with one colour above and one below. An unshadowed surface in the
+/// brightest direction shows exactly its own colour.
 #[derive(Debug, Clone)]
 pub struct Surroundings {
     lamps: Vec<Lamp>,
@@ -104,17 +119,17 @@ pub struct Surroundings {
 }
 
 impl Surroundings {
-    /// Scales the sky so that the luminance of the brightest direction without shadows is `contrast` times that of the
-    /// darkest, and then all light so that no channel of any direction exceeds 1. A contrast that the lamps alone do not
-    /// reach is not reached.
+    /// Scales the sky so that, without shadows, the luminance of the brightest direction is `contrast` times the
+    /// luminance of the darkest. Then scales all light so that no channel of any direction exceeds 1. The contrast of
+    /// the lamps alone is the upper limit.
     pub fn new(mut lamps: Vec<Lamp>, sky: [Vec3; 2], contrast: f32) -> Self {
         for lamp in &mut lamps {
             lamp.direction = lamp.direction.normalize_or(Vec3::Y);
-            // All lamps of a colour are equally bright, whatever their size.
+            // The total light of a lamp does not depend on its size.
             lamp.color *= 1.0 / (PI * lamp.radius * lamp.radius).min(TAU);
         }
         let ways = ways();
-        // What surfaces of all directions reflect.
+        // Light that a white surface reflects, for each direction as its normal.
         let reflected = |surroundings: &Self| -> Vec<Vec3> {
             let light = ways.iter().map(|d| surroundings.from(*d)).collect::<Vec<_>>();
             let sum = |normal: &Vec3| {
@@ -124,7 +139,7 @@ impl Surroundings {
             ways.iter().map(sum).collect()
         };
         let mut found = Self { lamps, sky };
-        // The contrast falls with the strength of the sky.
+        // Bisection: a stronger sky lowers the contrast.
         let (mut weak, mut strong) = (0.0_f32, 64.0_f32);
         for _ in 0..24 {
             let middle = 0.5 * (weak + strong);
@@ -140,7 +155,7 @@ impl Surroundings {
         found
     }
 
-    /// The surroundings turned around the vertical axis, as a camera that moves by this angle around the person.
+    /// The surroundings, rotated around the vertical axis like a camera that moves by this angle around the person.
     #[must_use]
     pub fn turned(&self, degrees: f32) -> Self {
         let (sin, cos) = libm::sincosf(degrees.to_radians());

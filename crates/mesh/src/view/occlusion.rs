@@ -1,41 +1,26 @@
-//! Which directions a mesh's surfaces see past the rest of the mesh, and the light that arrives from there.
+//! Visibility of directions from the surfaces of a mesh, and the light that arrives from visible directions.
 
 use std::collections::HashMap;
 
 use glam::{IVec3, Mat3, Vec3};
 use rayon::prelude::*;
 
-use super::light::{Surroundings, directions};
+use super::light::{PAIRS, SHARE, Surroundings, WAYS, ways};
+use crate::mesh::bounds;
 
-/// Directions from which light is summed, in pairs of opposites.
-const PAIRS: usize = 96;
-/// Number of directions.
-const WAYS: usize = 2 * PAIRS;
-/// Share of the light of one direction, so that light of 1 from everywhere is reflected as 1.
-pub(super) const SHARE: f32 = 4.0 / WAYS as f32;
-/// Pairs that are looked at before their results are joined, which bounds the memory.
+/// Number of pairs that are computed before their results are merged, which bounds the memory.
 const AT_ONCE: usize = 16;
-/// Cells of a depth map along the mesh's largest extent. Vertices that are nearer to each other share what they see.
+/// Cells of a depth map along the mesh's largest extent. Vertices in one cell share their visibility.
 const CELLS: f32 = 160.0;
-/// Share of a cell at which a surface looks for light before itself.
+/// Offset along the normal, in cells, at which a surface is looked up in the depth map.
 const OFF: f32 = 0.6;
 
 /// A bit for each direction.
 type Seen = [u64; WAYS / 64];
 
-/// The directions. The second half are the opposites of the first, in the same order.
-pub(super) fn ways() -> [Vec3; WAYS] {
-    let mut ways = [Vec3::ZERO; WAYS];
-    // The upper half of an even spread.
-    for (i, way) in directions(WAYS).take(PAIRS).enumerate() {
-        (ways[i], ways[i + PAIRS]) = (way, -way);
-    }
-    ways
-}
-
-/// Vertices that are near each other and face about the same way share one place.
+/// Clusters of nearby vertices that face about the same direction. A cluster is called place.
 struct Places {
-    /// Row of the place of each vertex.
+    /// Index of the place of each vertex.
     rows: Vec<u32>,
     positions: Vec<Vec3>,
     normals: Vec<Vec3>,
@@ -71,19 +56,18 @@ impl Places {
     }
 }
 
-/// What the surfaces of a mesh see.
+/// Directions that are visible from the surfaces of a mesh.
 pub struct Occlusion {
     ways: [Vec3; WAYS],
     places: Places,
-    /// By place. A direction before the surface is seen from its front, one behind it from its back.
+    /// By place. A direction in front of the surface is seen from its front, a direction behind it from its back.
     seen: Vec<Seen>,
 }
 
 impl Occlusion {
-    /// Looks along every direction at a depth map of the mesh, which holds the nearest and the farthest surface.
+    /// Renders a depth map of the nearest and the farthest surface along each pair of directions.
     pub fn new(positions: &[Vec3], normals: &[Vec3], faces: &[[u32; 3]]) -> Self {
-        let start = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        let (low, high) = positions.iter().fold(start, |(low, high), p| (low.min(*p), high.max(*p)));
+        let (low, high) = bounds(positions.iter().copied());
         let middle = 0.5 * (low + high);
         let cell = ((high - low).max_element() / CELLS).max(f32::MIN_POSITIVE);
         let places = Places::new(positions, normals, faces, cell);
@@ -110,8 +94,8 @@ impl Occlusion {
     /// Linear light that each vertex reflects on its front and on its back.
     pub fn light(&self, surroundings: &Surroundings, normals: &[Vec3]) -> Vec<[Vec3; 2]> {
         let light: Vec<Vec3> = self.ways.iter().map(|way| surroundings.from(*way) * SHARE).collect();
-        // By colour channel, the sum of the seen directions times their light: its product with a normal is what a
-        // surface reflects. A vertex differs a little from its place in its normal.
+        // By colour channel: the sum of the visible directions times their light. Its product with a normal is the
+        // reflected light. The normals of a place's vertices differ a little.
         let arriving = |(seen, normal): (&Seen, &Vec3)| {
             let mut sides = [Mat3::ZERO; 2];
             for (word, bits) in seen.iter().enumerate() {
@@ -135,9 +119,9 @@ impl Occlusion {
     }
 }
 
-/// Nearest and farthest surface along a direction, on a grid across it.
+/// Nearest and farthest surface along a direction, on a grid perpendicular to it.
 struct DepthMap {
-    /// Across to the right, across upwards, along the direction.
+    /// Right and up across the direction, and the direction itself.
     axes: [Vec3; 3],
     middle: Vec3,
     cell: f32,
@@ -159,7 +143,7 @@ impl DepthMap {
         map
     }
 
-    /// Column, row (whole numbers at the cells' middles) and depth.
+    /// Column, row (integers at the centres of cells) and depth of a point.
     fn place(&self, p: Vec3) -> Vec3 {
         let [x, y, z] = self.axes.map(|axis| axis.dot(p - self.middle));
         let half = self.side as f32 / 2.0 - 0.5;
@@ -190,10 +174,10 @@ impl DepthMap {
         }
     }
 
-    /// Whether the surface at `p` with this normal sees the direction and its opposite, each from the side that faces it.
+    /// Whether the surface at `p` with this normal sees the direction and its opposite, each from the side facing it.
     fn sees(&self, p: Vec3, normal: Vec3) -> [bool; 2] {
         let cosine = self.axes[2].dot(normal);
-        // The surface around p rises by so much within a cell.
+        // Depth change of the surface within a cell.
         let slope = (1.0 - cosine * cosine).max(0.0).sqrt() / cosine.abs().max(0.2);
         let tolerance = self.cell * (OFF + 0.7 * slope);
         let away = if cosine < 0.0 { -OFF } else { OFF } * self.cell;

@@ -1,4 +1,4 @@
-//! Textures, and colours of surfaces in their light.
+//! Texture filtering and shading.
 
 use std::sync::Arc;
 
@@ -6,15 +6,15 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 use image::RgbImage;
 use snapsnap_splat::Camera;
 
-use super::Renderer;
 use super::light::Lights;
+use crate::mesh::Mesh;
 
 /// Step in pixels for the derivative of texture coordinates.
 const STEP: f64 = 0.01;
 /// Most samples of a texture for one pixel.
 const MAX_TAPS: f32 = 8.0;
 
-/// A texture and its reductions, each half as large as the one before.
+/// A texture and its mip levels.
 pub struct Pyramid {
     levels: Vec<Arc<RgbImage>>,
 }
@@ -29,9 +29,9 @@ impl Pyramid {
         Self { levels }
     }
 
-    /// Colour at the texture coordinates `at`, filtered over a pixel. `right` and `down` are the changes of the coordinates
-    /// from one column and row to the next. On an oblique surface, several samples lie along the longer of them, each no
-    /// wider than the shorter one.
+    /// Colour at the texture coordinates `at`, filtered over a pixel. `right` and `down` are the changes of the
+    /// coordinates per column and row. On an oblique surface, several samples along the longer change are averaged
+    /// (anisotropic filter), each as wide as the shorter change.
     fn sample(&self, at: Vec2, right: Vec2, down: Vec2) -> Vec3 {
         let size = Vec2::new(self.levels[0].width() as f32, self.levels[0].height() as f32);
         let (a, b) = ((right * size).length(), (down * size).length());
@@ -72,7 +72,7 @@ fn bilinear(texture: &RgbImage, at: Vec2) -> Vec3 {
 
 /// The light on a mesh's surfaces in one view.
 pub enum Lit<'a> {
-    /// By the direction of the surface.
+    /// Light that depends on the surface's normal alone.
     Plain(&'a Lights),
     /// Linear light on the front and the back of each vertex.
     Vertices(Vec<[Vec3; 2]>),
@@ -80,7 +80,10 @@ pub enum Lit<'a> {
 
 /// Colours of a mesh's surfaces in the view of one camera.
 pub struct Shader<'a> {
-    pub renderer: &'a Renderer<'a>,
+    pub mesh: &'a Mesh,
+    pub normals: &'a [Vec3],
+    /// One per material.
+    pub textures: &'a [Option<Arc<Pyramid>>],
     pub camera: &'a Camera,
     /// Positions in the camera's frame.
     pub corners: &'a [DVec3],
@@ -90,11 +93,11 @@ pub struct Shader<'a> {
 impl Shader<'_> {
     /// Colour of `face` at pixel coordinates `at`; `plane` gives 1/z there.
     pub fn color(&self, face: usize, at: DVec2, plane: DVec3) -> Vec3 {
-        let Renderer { mesh, normals, textures, .. } = self.renderer;
+        let Self { mesh, normals, textures, .. } = self;
         let face = &mesh.faces[face];
         let weights = self.weights(face.positions, at, plane).as_vec3();
         let mix = |values: [Vec3; 3]| values[0] * weights.x + values[1] * weights.y + values[2] * weights.z;
-        // The visible side of the surface is lit.
+        // The side towards the camera is lit.
         let corners = face.positions.map(|row| self.corners[row as usize]);
         let is_back = (corners[1] - corners[0]).cross(corners[2] - corners[0]).dot(corners[0]) > 0.0;
         let light = match &self.light {
@@ -120,14 +123,14 @@ impl Shader<'_> {
                 coordinates[0] * w.x + coordinates[1] * w.y + coordinates[2] * w.z
             };
             let here = coordinate(at);
-            // Change per pixel, from a small step, since a whole one may lead beyond the horizon.
+            // Change per pixel, from a small step, since the step of a whole pixel may lead beyond the horizon.
             let change = |way: DVec2| ((coordinate(at + STEP * way) - here) / STEP).as_vec2();
             color *= texture.sample(here.as_vec2(), change(DVec2::X), change(DVec2::Y));
         }
         color
     }
 
-    /// Barycentric weights of the point of the triangle's plane at pixel coordinates `at`.
+    /// Barycentric weights of the point on the triangle's plane at pixel coordinates `at`.
     fn weights(&self, rows: [u32; 3], at: DVec2, plane: DVec3) -> DVec3 {
         let [a, b, c] = rows.map(|row| self.corners[row as usize]);
         let inverse_depth = plane.dot(DVec3::new(at.x, at.y, 1.0));

@@ -8,7 +8,7 @@ use super::{Renderer, View, ViewOptions};
 use crate::mesh::{Face, Material, Mesh};
 use crate::view::{Lamp, Light, Lights, Surroundings};
 
-/// At the origin, looking along z.
+/// A camera at the origin that looks along +z.
 fn camera(width: u32, height: u32) -> Camera {
     Camera {
         width,
@@ -55,7 +55,7 @@ fn sphere(centre: Vec3, radius: f32, levels: usize) -> Mesh {
     mesh(positions, &faces)
 }
 
-/// Unit ray through a pixel's centre, scaled to z = 1.
+/// Ray through a pixel's centre with z = 1.
 fn ray(camera: &Camera, pixel: usize) -> DVec3 {
     let (x, y) = (pixel % camera.width as usize, pixel / camera.width as usize);
     let at = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
@@ -196,7 +196,7 @@ fn neighbouring_triangles_share_no_sample_and_leave_none_out() {
     assert!(whole.alpha.iter().all(|alpha| *alpha == 1.0));
 }
 
-/// A view towards a corner of a cube with a picture on every side. The camera projects each point of the picture to its place.
+/// A view of a corner of a cube with a picture on every side: each pixel shows the point that it sees.
 #[test]
 fn a_textured_cube_shows_its_picture_undistorted() {
     let mut positions = Vec::new();
@@ -241,7 +241,7 @@ fn a_textured_cube_shows_its_picture_undistorted() {
         let axis = enter.to_array().iter().position(|t| *t == z).expect("one of them");
         let sign = -ray[axis].signum();
         let p = (eye + z * ray) / 0.4;
-        // As the corners' texture coordinates were made.
+        // The same axes as for the corners' texture coordinates.
         let side = (axis + 1) % 3;
         let (s, t) = (p[side] * sign, p[(side + 1) % 3]);
         if s.abs().max(t.abs()) < 0.9 {
@@ -343,7 +343,7 @@ fn a_ball_shades_the_floor_on_the_side_away_from_the_lamp() {
     assert!(turned[row.expect("a vertex")][0].x.powf(1.0 / 2.2) < 0.75 * mirrored);
 }
 
-/// Nothing hides a convex surface from the directions before it.
+/// Nothing occludes the directions in front of a convex surface.
 #[test]
 fn a_ball_alone_has_the_light_of_its_normals_with_the_given_contrast() {
     let mesh = sphere(Vec3::new(0.0, 1.0, 0.0), 0.9, 5);

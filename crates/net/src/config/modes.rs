@@ -1,4 +1,4 @@
-//! The choices of a config. Their names in a config are those of the variants, in kebab case.
+//! The enumerations of a config. A config names their variants in kebab case.
 
 use burn::tensor::FloatDType;
 use serde::{Deserialize, Serialize};
@@ -30,15 +30,15 @@ choices! {
         Convolution,
     }
 
-    /// Origin of predicted points (docs/method.md, "Ray anchors").
+    /// Reference point of predicted points (docs/method.md, "Ray anchors").
     Anchor {
         /// The front camera: direction and exponential distance, as published.
         None,
-        /// Where the pixel's ray, of the nominal camera, meets the plane through the body's axis: metres over δ.
+        /// The intersection of the pixel's nominal ray with the plane through the body's axis: metres over δ.
         Ray,
     }
 
-    /// Fusion of the photographs' tokens into those of the unseen sides (docs/method.md, "Tokens of the sides").
+    /// Fusion of the photographs' tokens into tokens of the unseen sides (docs/method.md, "Tokens of the sides").
     Fusion {
         /// Arithmetic mean at equal token positions.
         Mean,
@@ -46,11 +46,11 @@ choices! {
         Concat,
     }
 
-    /// Origin of the maps of the unseen sides.
+    /// How the maps of the unseen sides are made.
     Sides {
-        /// Heads beside those of the photographs.
+        /// By heads of their own, beside the heads of the photographs.
         Predicted,
-        /// The points of both photographs, projected into the sides' cameras and completed
+        /// From the points of both photographs, projected into the sides' cameras and completed
         /// (docs/method.md, "Completed sides").
         Completed,
     }
@@ -74,32 +74,24 @@ choices! {
 
     /// Reference of the regressor's output (docs/method.md, "Attributes").
     RegressorStart {
-        /// Fixed: at zero output a Gaussian has a size of 0.7 mm and opacity ½.
+        /// Fixed: at zero output a Gaussian has a size of 0.7 mm and opacity ½. Its colour is the network's output.
         Published,
-        /// The point map and the picture: at zero output a Gaussian is round, as large as its point's distance from its
-        /// neighbours asks, and has an opacity of 0.9 or more.
+        /// The point map and the picture: at zero output a Gaussian is round, its size is 0.3 times the distance of
+        /// the neighbouring points, its opacity is 0.9 or more, and the network corrects its pixel's colour.
         Geometric,
-    }
-
-    /// Source of a Gaussian's colour (docs/method.md, "Colour residual").
-    RegressorColor {
-        /// The network's own.
-        Free,
-        /// The pixel's, which the network corrects.
-        Residual,
     }
 
     /// Axes that predicted quaternions refer to.
     RotationFrame {
-        /// The front camera's. Quaternions are rotated into the world with the means.
+        /// The front camera's axes. Quaternions are rotated into the world with the means.
         Camera,
-        /// Passed on unchanged, as if they were in world axes.
+        /// World axes: quaternions are passed on unchanged.
         World,
     }
 
     /// Reduction of the canvas to the network's input.
     Downsample {
-        /// Mean over the pixels that fall into one.
+        /// The mean of each cell.
         Area,
         /// The first pixel of each cell.
         Nearest,
@@ -119,20 +111,8 @@ choices! {
         F32,
         /// 8 bits of mantissa, the range of f32.
         Bf16,
-        /// 11 bits of mantissa, up to 65,504: the loss is scaled, so that small gradients do not vanish.
+        /// 11 bits of mantissa, up to 65,504. Not for trainings.
         F16,
-    }
-
-    /// What is asked for: a precision, or the fastest that fits.
-    PrecisionChoice {
-        /// As `Precision::F32`.
-        F32,
-        /// As `Precision::Bf16`.
-        Bf16,
-        /// As `Precision::F16`.
-        F16,
-        /// The weights' own precision on a CPU with instructions for bf16, f32 elsewhere.
-        Auto,
     }
 }
 
@@ -146,7 +126,7 @@ impl Precision {
         }
     }
 
-    /// Burn's name.
+    /// Burn's float type.
     pub fn dtype(self) -> FloatDType {
         match self {
             Self::F32 => FloatDType::F32,
@@ -158,27 +138,5 @@ impl Precision {
     /// Whether it is f32.
     pub fn is_f32(&self) -> bool {
         *self == Self::F32
-    }
-}
-
-impl PrecisionChoice {
-    /// The precision, if it depends on nothing.
-    pub fn fixed(self) -> Option<Precision> {
-        match self {
-            Self::F32 => Some(Precision::F32),
-            Self::Bf16 => Some(Precision::Bf16),
-            Self::F16 => Some(Precision::F16),
-            Self::Auto => None,
-        }
-    }
-}
-
-impl From<Precision> for PrecisionChoice {
-    fn from(precision: Precision) -> Self {
-        match precision {
-            Precision::F32 => Self::F32,
-            Precision::Bf16 => Self::Bf16,
-            Precision::F16 => Self::F16,
-        }
     }
 }

@@ -34,7 +34,7 @@ impl SelfAttention {
     }
 }
 
-/// Cross-attention: queries from one side's tokens, keys and values from the other's.
+/// Cross-attention: queries from one photograph's tokens, keys and values from the other's tokens.
 #[derive(Module, Debug)]
 pub struct CrossAttention {
     projq: Linear,

@@ -10,6 +10,8 @@ use snapsnap_ops::{Rope, linear_gelu};
 
 /// Epsilon of every layer normalisation.
 const NORM_EPSILON: f64 = 1e-6;
+/// Hidden channels of an MLP, as a multiple of its token channels.
+const MLP_RATIO: usize = 4;
 
 pub(crate) fn layer_norm(dim: usize, device: &Device) -> LayerNorm {
     LayerNormConfig::new(dim).with_epsilon(NORM_EPSILON).init(device)
@@ -28,10 +30,10 @@ pub struct Mlp {
 }
 
 impl Mlp {
-    fn new(dim: usize, ratio: usize, device: &Device) -> Self {
+    fn new(dim: usize, device: &Device) -> Self {
         Self {
-            fc1: LinearConfig::new(dim, ratio * dim).init(device),
-            fc2: LinearConfig::new(ratio * dim, dim).init(device),
+            fc1: LinearConfig::new(dim, MLP_RATIO * dim).init(device),
+            fc2: LinearConfig::new(MLP_RATIO * dim, dim).init(device),
         }
     }
 
@@ -50,12 +52,12 @@ pub struct EncoderBlock {
 }
 
 impl EncoderBlock {
-    pub(crate) fn new(dim: usize, heads: usize, mlp_ratio: usize, device: &Device) -> Self {
+    pub(crate) fn new(dim: usize, heads: usize, device: &Device) -> Self {
         Self {
             norm1: layer_norm(dim, device),
             attn: SelfAttention::new(dim, heads, device),
             norm2: layer_norm(dim, device),
-            mlp: Mlp::new(dim, mlp_ratio, device),
+            mlp: Mlp::new(dim, device),
         }
     }
 
@@ -66,7 +68,7 @@ impl EncoderBlock {
     }
 }
 
-/// x + SA(LN₁ x), then x + CA(LN₂ x, LN_y y), then x + MLP(LN₃ x); `y` are the other side's tokens.
+/// x + SA(LN₁ x), then x + CA(LN₂ x, LN_y y), then x + MLP(LN₃ x); `y` are the other photograph's tokens.
 #[derive(Module, Debug)]
 pub struct DecoderBlock {
     norm1: LayerNorm,
@@ -79,7 +81,7 @@ pub struct DecoderBlock {
 }
 
 impl DecoderBlock {
-    pub(crate) fn new(dim: usize, heads: usize, mlp_ratio: usize, device: &Device) -> Self {
+    pub(crate) fn new(dim: usize, heads: usize, device: &Device) -> Self {
         Self {
             norm1: layer_norm(dim, device),
             attn: SelfAttention::new(dim, heads, device),
@@ -87,7 +89,7 @@ impl DecoderBlock {
             norm_y: layer_norm(dim, device),
             cross_attn: CrossAttention::new(dim, heads, device),
             norm3: layer_norm(dim, device),
-            mlp: Mlp::new(dim, mlp_ratio, device),
+            mlp: Mlp::new(dim, device),
         }
     }
 

@@ -1,31 +1,31 @@
-//! The unseen sides from the photographs' points (docs/method.md, "Completed sides"): the points are projected into the
-//! side's camera, and a U-shaped network completes what they leave open. The left is the right of the mirrored person, so
-//! that one network serves both.
+//! The unseen sides from the photographs' points (docs/method.md, "Completed sides"): the points are projected into
+//! the side's camera, and a U-shaped network completes and corrects them. The left is the right of the mirrored
+//! person, so that one network serves both sides.
 
 use burn::module::Module;
 use burn::nn::conv::Conv2d;
 use burn::tensor::{Device, Tensor};
 
 use super::View;
-use super::anchor::Rays;
-use super::convolution::{UNet, UNetSizes};
 use super::dpt::conv1x1;
+use super::rays::Rays;
 use super::shells::{Visible, depths};
+use super::unet::{UNet, UNetSizes};
 use crate::config::{NetworkConfig, OPPOSITE};
-use crate::crop::Window;
+use crate::window::Window;
+use snapsnap_ops::gather::taken;
 use snapsnap_ops::host;
 use snapsnap_ops::layers::conv2d;
-use snapsnap_ops::rows::taken;
 
-/// Channels of a photographed pixel's features on a side.
+/// Channels of the predictor's features in the input.
 const FEATURES: usize = 16;
-/// Channels of the input: depth, colour, front or back, and features of the nearest point; depth of a second one, and whether
-/// there is one; depth of the farthest.
+/// Channels of the input. Nearest point: depth, colour, front or back, features. Second point: depth, whether there
+/// is one. Farthest point: depth.
 const INPUTS: usize = 1 + 3 + 2 + FEATURES + 2 + 1;
-/// Depths beside the plane through the body's axis are in metres over this, so that they are as large as colours.
+/// Metres per unit of the input's depths, which start at the plane through the body's axis: as large as colours.
 const DEPTH_UNIT: f64 = 0.2;
 
-/// What both photographs tell, at the network's resolution.
+/// Data of both photographs at the network's resolution.
 pub struct Photographed<'a> {
     /// `[B, 2, h, w, 3]` front and back: points in metres, front camera's frame.
     pub points: Tensor<5>,
@@ -33,7 +33,7 @@ pub struct Photographed<'a> {
     pub colors: Tensor<5>,
     /// `[B, 2, 1, h, w]` share of the person.
     pub masks: Tensor<5>,
-    /// `[B, last_dim, h, w]` of the predictor's decoder, for front and mirrored back.
+    /// Features `[B, last_dim, h, w]` of the predictor's decoder, for front and mirrored back.
     pub features: Tensor<4>,
     /// Images of the predictor's levels `[B, layer_dims, ..]`.
     pub levels: &'a [Tensor<4>],
@@ -41,11 +41,11 @@ pub struct Photographed<'a> {
     pub window: &'a Window,
 }
 
-/// The network.
+/// The completion network.
 #[derive(Module, Debug)]
 pub struct Completion {
     embed: Conv2d,
-    /// By level: from the predictor's row means over both halves of the person.
+    /// By level: convolutions of the predictor's row means over both halves of the person.
     rows: Vec<Conv2d>,
     body: UNet,
     #[module(skip)]
@@ -72,8 +72,8 @@ impl Completion {
         }
     }
 
-    /// Raw x, y, z, confidence `[B, 4, h, w]` of the right and the left, as differences from the anchors over δ `[1]`, and the
-    /// same of their second surfaces, if the network has them.
+    /// Raw x, y, z, confidence `[B, 4, h, w]` of right and left, then of their second surfaces, if the network has
+    /// them. Points are differences from the anchors over δ `[1]`.
     pub(super) fn forward(&self, photographed: &Photographed, delta: &Tensor<1>) -> Vec<Tensor<4>> {
         let [b, _, h, w, _] = photographed.points.dims();
         let table = self.table(photographed);
@@ -89,7 +89,7 @@ impl Completion {
             .map(|(seen, mirrored)| if mirrored { seen.image.clone().flip([3]) } else { seen.image.clone() })
             .collect();
         let levels = self.body.encode(Tensor::cat(images, 0), Some(self.row_means(photographed.levels)));
-        let out = self.body.out(self.body.features(&levels));
+        let out = self.body.decoder.out(self.body.features(&levels));
         let out = [out.clone().narrow(0, 0, b), out.narrow(0, b, b).flip([3])];
         let raw = |layer: usize, seen: &SideInput, out: &Tensor<4>| {
             let known = seen.depths[layer].clone();
@@ -102,11 +102,11 @@ impl Completion {
         (0..if self.second_layer { 2 } else { 1 }).flat_map(of_layer).collect()
     }
 
-    /// Colour, shell and features of all pixels of both photographs `[B, N, 5 + FEATURES]`.
+    /// Colour, front or back, and features of all pixels of both photographs `[B, N, 5 + FEATURES]`.
     fn table(&self, Photographed { colors, features, .. }: &Photographed) -> Tensor<3> {
         let ([b, _, _, h, w], device) = (colors.dims(), colors.device());
         let features = conv2d(&self.embed, features.clone(), true);
-        // The back photograph is not mirrored here.
+        // The features of the mirrored back are flipped: its points are not mirrored.
         let features = Tensor::stack::<5>(vec![features.clone(), features.flip([3])], 1);
         let shells = Tensor::<2>::eye(2, &device).reshape([1, 2, 2, 1, 1]).expand([b, 2, 2, h, w]);
         let all = Tensor::cat(vec![colors.clone(), shells, features], 2);
@@ -114,7 +114,7 @@ impl Completion {
         all.permute([0, 1, 3, 4, 2]).reshape([b, 2 * h * w, channels])
     }
 
-    /// By level, for right and mirrored left `[2·B, side_dims, h, 1]`: means over the near and the far half of the person.
+    /// By level, for right and mirrored left `[2·B, side_dims, h, 1]`: row means of the person's near and far half.
     fn row_means(&self, levels: &[Tensor<4>]) -> Vec<Tensor<4>> {
         let means = |(layer, image): (&Conv2d, &Tensor<4>)| {
             let half = image.dims()[3] / 2;
@@ -127,18 +127,18 @@ impl Completion {
     }
 }
 
-/// The points of both photographs in the picture of a side.
+/// The points of both photographs in the image of a side.
 struct SideInput {
     /// Input of the network `[B, INPUTS, h, w]`.
     image: Tensor<4>,
-    /// Depths of the nearest and of a second point beside the anchor `[B, 1, h, w]`, metres; 0 where there is no point.
+    /// Depths of the nearest and the second point minus the anchor's `[B, 1, h, w]`, metres; 0 without a point.
     depths: [Tensor<4>; 2],
     /// Directions of the rays `[1, h, w, 3]`, scaled to a depth of 1 in the view's camera.
     directions: Tensor<4>,
 }
 
 impl SideInput {
-    /// Of `points` `[B, N, 3]` and the table of their channels.
+    /// From `points` `[B, N, 3]` and the table of their channels `[B, N, ..]`.
     fn new(
         view: View,
         side: usize,
@@ -182,9 +182,10 @@ mod tests {
 
     use super::*;
     use crate::config::{Body, Config};
-    use crate::names::{NamedMapper, ParameterPath, map_named};
-    use crate::network::anchor::nominal;
+    use crate::network::predictor::Body as PredictorBody;
+    use crate::network::rays::nominal;
     use crate::network::{Input, PointMap, anchors};
+    use crate::parameters::{NamedMapper, ParameterPath, map_named};
     use crate::weights::random_predictor;
 
     const SIDE: usize = 64;
@@ -245,10 +246,12 @@ mod tests {
 
     fn network() -> Completion {
         let config = Config { network: config(), ..Config::default() };
-        random_predictor(&config, 3, &Device::flex()).completion().expect("completed sides").clone()
+        let predictor = random_predictor(&config, 3, &Device::flex());
+        let PredictorBody::Convolution(net) = predictor.body else { panic!("the body is a transformer") };
+        net.completion.expect("completed sides")
     }
 
-    /// The mirrored person's right is the mirrored left, and the other way round.
+    /// The right of a mirrored person is the mirrored left of the person, and the other way round.
     #[test]
     fn a_mirrored_person_has_mirrored_sides_exchanged() {
         let window = Window { rows: 8..56, columns: 16..48 };
@@ -299,7 +302,7 @@ mod tests {
             vec![Tensor::zeros([1, n, 3], &device), Tensor::ones([1, n, 2 + FEATURES], &device)],
             2,
         );
-        // Two channels tell which photograph a point is of; here each counts a half.
+        // Two channels, front and back, mark that there is a point; here both are ½.
         let seen = SideInput::new(View::Right, SIDE, &window, (points.clone(), table * 0.5), rows);
         let gradients = seen.depths[0].clone().sum().backward();
         let gradient = host(points.grad(&gradients).expect("a gradient"));
@@ -310,7 +313,7 @@ mod tests {
         }
     }
 
-    /// The predictor of all views, whose layers of completed sides correct nothing, on random photographs.
+    /// Points of all views from random photographs, by a predictor whose completion network corrects nothing.
     fn uncorrected(both_ways: bool, b: usize) -> Vec<(View, Vec<f32>)> {
         struct Nothing;
         impl NamedMapper for Nothing {

@@ -102,7 +102,7 @@ impl Fusion {
         }
     }
 
-    /// `coarse` may overhang `fine` by one row or column (odd token grids) and is cut to its size.
+    /// `coarse` may exceed `fine` by one row or column (odd token grids) and is cropped to the size of `fine`.
     fn forward(&self, coarse: Tensor<4>, fine: Option<Tensor<4>>) -> Tensor<4> {
         let sum = match fine {
             Some(fine) => {
@@ -168,7 +168,7 @@ impl DptHead {
                 refinenet1: Fusion::new(f, device),
                 refinenet2: Fusion::new(f, device),
                 refinenet3: Fusion::new(f, device),
-                // Its first residual unit is in every checkpoint and never runs; kept so that files round-trip.
+                // Every checkpoint has its first residual unit, which never runs; kept so that files round-trip.
                 refinenet4: Fusion::new(f, device),
             },
             head: Output {

@@ -11,39 +11,11 @@ use burn::tensor::{Device, Tensor};
 use super::block::{DecoderBlock, EncoderBlock, layer_norm, normalise};
 use super::dpt::DptHead;
 use super::linear::LinearHead;
+use super::rope;
+use super::view::View;
 use crate::config::{Fusion, HeadKind, NetworkConfig};
+use snapsnap_ops::as_weight;
 use snapsnap_ops::layers::{linear, patches};
-use snapsnap_ops::{Rope, as_weight};
-
-/// One side of the person. The sides are named as seen in the front picture.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum View {
-    /// Photographed; all points are in the frame of its camera.
-    Front,
-    /// Photographed.
-    Back,
-    /// Unseen; camera yaw +90° from the front.
-    Right,
-    /// Unseen; camera yaw +270° from the front.
-    Left,
-    /// The second surface that faces the right's camera, such as the flank behind an arm.
-    RightSecond,
-    /// The same of the left.
-    LeftSecond,
-}
-
-impl View {
-    /// All views without second surfaces, in the order of the heads, of the fixtures and of the concatenated Gaussians.
-    pub const ALL: [Self; 4] = [Self::Front, Self::Back, Self::Right, Self::Left];
-    /// The same, followed by the second surfaces of the sides (`network.second_layer`).
-    pub const WITH_SECOND: [Self; 6] =
-        [Self::Front, Self::Back, Self::Right, Self::Left, Self::RightSecond, Self::LeftSecond];
-
-    /// Lower-case name.
-    pub fn name(self) -> &'static str {
-        ["front", "back", "right", "left", "right-second", "left-second"][self as usize]
-    }
-}
 
 #[derive(Module, Debug)]
 struct PatchEmbed {
@@ -57,22 +29,7 @@ enum Head {
     Linear(LinearHead),
 }
 
-/// Rows and columns of the tokens of an image.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Grid(pub [usize; 2]);
-
-impl Grid {
-    /// Number of tokens.
-    pub fn tokens(&self) -> usize {
-        self.0.iter().product()
-    }
-
-    fn rope(&self, head_dim: usize, base: f64, device: &Device) -> Rope {
-        Rope::new(self.0[0], self.0[1], head_dim, base, device)
-    }
-}
-
-/// Token maps of one photograph: entry 0 is the encoder's output, entry l the l-th decoder layer's, all `[B, N, C]`.
+/// Token maps `[B, N, C]` of one photograph: entry 0 is the encoder's output, entry l the output of layer l.
 pub type TokenMaps = Vec<Tensor<3>>;
 
 /// The network of DUSt3R with two or four heads.
@@ -97,8 +54,8 @@ impl Dust3r {
     pub(crate) fn new(config: &NetworkConfig, device: &Device) -> Self {
         let c = config;
         let patch = [c.patch, c.patch];
-        let encoder = |_| EncoderBlock::new(c.enc_dim, c.enc_heads, c.mlp_ratio, device);
-        let decoder = |_| DecoderBlock::new(c.dec_dim, c.dec_heads, c.mlp_ratio, device);
+        let encoder = |_| EncoderBlock::new(c.enc_dim, c.enc_heads, device);
+        let decoder = |_| DecoderBlock::new(c.dec_dim, c.dec_heads, device);
         let head = |fused: bool| {
             let double = if fused && c.fusion == Fusion::Concat { 2 } else { 1 };
             match c.head {
@@ -137,28 +94,16 @@ impl Dust3r {
         name.contains("downstream_head") && (name.ends_with(".head.4") || name.ends_with(".proj"))
     }
 
-    /// Whether it has heads for the unseen sides.
+    /// Whether the network has heads for the unseen sides.
     pub fn has_sides(&self) -> bool {
         self.downstream_head3.is_some()
     }
 
-    /// All tokens of an image of `height` × `width` pixels.
-    ///
-    /// # Panics
-    /// If a side is no multiple of the patch.
-    pub fn grid(&self, [height, width]: [usize; 2]) -> Grid {
-        let patch = self.config.patch;
-        assert!(
-            height % patch == 0 && width % patch == 0 && height * width > 0,
-            "image {height}×{width}: both sides must be positive multiples of the patch {patch}"
-        );
-        Grid([height / patch, width / patch])
-    }
-
-    /// Images `[B, C, H, W]`, colours in [−1, 1] first → normalised encoder tokens `[B, N, enc_dim]`.
-    pub fn encode(&self, images: Tensor<4>, grid: &Grid) -> Tensor<3> {
+    /// Images `[B, C, H, W]`, colours in [−1, 1] first → normalised encoder tokens `[B, N, enc_dim]`. The token
+    /// `grid` has rows and columns.
+    pub fn encode(&self, images: Tensor<4>, grid: [usize; 2]) -> Tensor<3> {
         let c = &self.config;
-        let rope = grid.rope(c.enc_dim / c.enc_heads, c.rope_base, &images.device());
+        let rope = rope(grid, c.enc_dim / c.enc_heads, &images.device());
         let proj = &self.patch_embed.proj;
         let tokens = patches(proj, as_weight(images, &proj.weight));
         let tokens = self.enc_blocks.iter().fold(tokens, |x, block| block.forward(x, &rope));
@@ -167,10 +112,10 @@ impl Dust3r {
 
     /// Encoder tokens of the two photographs `[B, N, enc_dim]` → all token maps of each.
     ///
-    /// Both decoders read the other's tokens of the *previous* layer.
-    pub fn decode(&self, front: Tensor<3>, back: Tensor<3>, grid: &Grid) -> [TokenMaps; 2] {
+    /// Each decoder reads the other decoder's tokens of the *previous* layer.
+    pub fn decode(&self, front: Tensor<3>, back: Tensor<3>, grid: [usize; 2]) -> [TokenMaps; 2] {
         let c = &self.config;
-        let rope = grid.rope(c.dec_dim / c.dec_heads, c.rope_base, &front.device());
+        let rope = rope(grid, c.dec_dim / c.dec_heads, &front.device());
         let mut x = linear(&self.decoder_embed, front.clone());
         let mut y = linear(&self.decoder_embed, back.clone());
         let (mut front, mut back) = (vec![front], vec![back]);
@@ -190,7 +135,7 @@ impl Dust3r {
     ///
     /// # Panics
     /// If the network has no head for `view`.
-    pub fn raw_points(&self, view: View, [front, back]: &[TokenMaps; 2], grid: &Grid) -> Tensor<4> {
+    pub fn raw_points(&self, view: View, [front, back]: &[TokenMaps; 2], grid: [usize; 2]) -> Tensor<4> {
         let head = match view {
             View::Front => &self.downstream_head1,
             View::Back => &self.downstream_head2,
@@ -204,8 +149,8 @@ impl Dust3r {
             _ => self.fuse(front[i].clone(), back[i].clone()),
         };
         match head {
-            Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid.0),
-            Head::Dpt(head) => head.forward(self.config.hooks.map(tokens), grid.0),
+            Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid),
+            Head::Dpt(head) => head.forward(self.config.hooks.map(tokens), grid),
         }
     }
 

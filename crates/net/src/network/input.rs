@@ -3,24 +3,24 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_splat::Camera;
 
-use super::{Grid, View};
+use super::View;
 use crate::config::Config;
-use crate::crop::Window;
 use crate::resample::shrink;
+use crate::window::Window;
 
 /// Input of the point predictor: B pairs of photographs.
 #[derive(Debug, Clone)]
 pub struct Input {
-    /// `[2·B, C, h, w]`, all fronts, then all backs: colours in [−1, 1] times the mask, then what else the config adds. With
-    /// `network.both_ways` each of both halves is followed by its mirror images.
+    /// `[2·B, C, h, w]`, all fronts, then all backs: colours in [−1, 1] times the mask, then the config's further
+    /// channels. With `network.both_ways`, the fronts and the backs are each followed by their mirror images.
     pub images: Tensor<4>,
-    /// A transformer's tokens of them.
-    pub grid: Grid,
+    /// Rows and columns of the transformer's tokens of an image.
+    pub grid: [usize; 2],
 }
 
 impl Input {
-    /// The input for the `window` of photographs `[2·B, 3, S, S]` on their canvases, all fronts, then all backs, and of their masks
-    /// `[2·B, 1, S, S]`.
+    /// The input for the `window` of photographs `[2·B, 3, S, S]` on their canvases, all fronts, then all backs, and
+    /// of their masks `[2·B, 1, S, S]`.
     pub fn new(config: &Config, photographs: Tensor<4>, masks: Tensor<4>, window: &Window) -> Self {
         let n = &config.network;
         let small = |x: Tensor<4>| {
@@ -39,25 +39,25 @@ impl Input {
         }
         let images = if parts.len() > 1 { Tensor::cat(parts, 1) } else { parts.remove(0) };
         let seen = |x: Tensor<4>| if n.mirror { mirrored_backs(x) } else { x };
-        Self { images: seen(images), grid: Grid([height / n.patch, width / n.patch]) }
+        Self { images: seen(images), grid: [height / n.patch, width / n.patch] }
     }
 }
 
-/// Each half of a batch, followed by its mirror images.
+/// Appends the mirror images of each half of a batch to the half.
 fn both_ways(x: Tensor<4>) -> Tensor<4> {
     let half = x.dims()[0] / 2;
     let halves = [0, half].map(|from| x.clone().narrow(0, from, half));
     Tensor::cat(halves.into_iter().flat_map(|x| [x.clone(), x.flip([3])]).collect(), 0)
 }
 
-/// The second half of a batch flipped.
+/// Flips the second half of a batch.
 fn mirrored_backs(x: Tensor<4>) -> Tensor<4> {
     let half = x.dims()[0] / 2;
     Tensor::cat(vec![x.clone().narrow(0, 0, half), x.narrow(0, half, half).flip([3])], 0)
 }
 
-/// Directions of a photograph's network pixels as the front's nominal camera has them, x/z and y/z, of which a back opposite
-/// has −x/z: `[1, 2, h, w]`.
+/// Ray directions of a photograph's network pixels `[1, 2, h, w]`: x/z and y/z in the nominal camera's frame, with
+/// the sign of x/z changed for the back.
 fn rays(config: &Config, view: View, window: &Window, device: &Device) -> Tensor<4> {
     let camera = Camera::orbit_at_yaw_degrees(0.0, config.network.resolution as u32);
     let factor = config.upsample_factor();

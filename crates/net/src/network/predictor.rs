@@ -4,15 +4,16 @@ use burn::module::{Module, Param};
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
 
-use super::anchor::anchors;
 use super::completion::Photographed;
-use super::convolution::{Levels, PointUNet};
-use super::dust3r::{Dust3r, Grid, TokenMaps, View};
+use super::convolution::PointUNet;
+use super::dust3r::{Dust3r, TokenMaps};
 use super::input::Input;
-use super::rays::on_rays;
+use super::rays::{anchors, on_rays};
+use super::unet::Levels;
+use super::view::View;
 use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Sides, Upsample};
-use crate::crop::Window;
 use crate::resample::shrink;
+use crate::window::Window;
 use snapsnap_ops::bilinear;
 
 /// Points and confidences on one view's pixel grid. [`PointPredictor::heads`] returns network units, and corrections
@@ -27,9 +28,9 @@ pub struct PointMap {
 }
 
 impl PointMap {
-    /// A view's map of a window, pasted into the whole canvas of `config`, which is 0 elsewhere. With `network.on_rays`,
-    /// the points of a photograph are moved onto their pixels' rays. The losses of stage 1 compare maps before that move, so that
-    /// the network still learns where the rays are.
+    /// Pastes a view's map of a window into the whole canvas of `config`, which is 0 elsewhere. With
+    /// `network.on_rays`, the points of a photograph are moved onto their pixels' rays. The losses of stage 1 compare
+    /// maps before this move, so that the network still learns the directions of rays.
     pub fn pasted(self, config: &NetworkConfig, view: View, window: &Window) -> Self {
         let Self { mut points, conf } = self;
         let side = config.resolution;
@@ -44,8 +45,8 @@ impl PointMap {
     }
 }
 
-/// Larger exponents are cut to this one, since e⁸⁸ is in the range of f32. Only untrained networks reach it, but their
-/// results too must be finite.
+/// Largest exponent: e⁸⁸ is in the range of f32. Larger exponents are clamped. Only untrained networks reach it, but
+/// their results must be finite, too.
 const MAX_EXPONENT: f64 = 88.0;
 
 /// Raw x, y, z, confidence `[B, 4, H, W]` → point map: p = r / ‖r‖ · (e^‖r‖ − 1), or p = r with anchors
@@ -80,8 +81,8 @@ fn growth(x: Tensor<4>) -> Tensor<4> {
     direct.mask_where(x.lower_elem(SMALL), series)
 }
 
-/// Merges both halves of a batch into one of half the size, for `network.both_ways`. The second half has the maps of the
-/// mirrored photographs. They are flipped, their x is negated, and right and left are exchanged. The result is the mean.
+/// The mean of both halves of a batch, for `network.both_ways`. The second half has the maps of the mirrored
+/// photographs. These are flipped, their x is negated, and right and left are exchanged.
 fn mean_with_mirrored(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
     let mirrored = |view: View| match view {
         View::Right => View::Left,
@@ -105,8 +106,8 @@ fn mean_with_mirrored(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
 /// Output of the encoder.
 #[derive(Debug, Clone)]
 pub enum Encoded {
-    /// Tokens `[2·B, N, enc_dim]` of all fronts, then all backs.
-    Tokens(Tensor<3>, Grid),
+    /// Tokens `[2·B, N, enc_dim]` of all fronts, then all backs, and their rows and columns.
+    Tokens(Tensor<3>, [usize; 2]),
     /// Feature images of the convolutional body, which receives both photographs at once.
     Levels(Levels),
 }
@@ -115,8 +116,8 @@ pub enum Encoded {
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant, reason = "there is one at a time")]
 pub enum Decoded {
-    /// Token maps of the front and of the back.
-    Tokens([TokenMaps; 2], Grid),
+    /// Token maps of the front and of the back, and the rows and columns of the tokens.
+    Tokens([TokenMaps; 2], [usize; 2]),
     /// Feature images of the convolutional body, and the features of the photographs' pixels `[B, last_dim, h, w]`.
     Levels(Levels, Tensor<4>),
 }
@@ -124,7 +125,7 @@ pub enum Decoded {
 /// The network between photographs and raw points.
 #[derive(Module, Debug)]
 #[allow(clippy::large_enum_variant, reason = "there is one at a time")]
-enum Body {
+pub(super) enum Body {
     Transformer(Dust3r),
     Convolution(PointUNet),
 }
@@ -134,7 +135,7 @@ enum Body {
 pub struct PointPredictor {
     /// δ `[1]`: metres per network unit.
     scale: Param<Tensor<1>>,
-    body: Body,
+    pub(super) body: Body,
     #[module(skip)]
     config: NetworkConfig,
 }
@@ -148,15 +149,6 @@ impl PointPredictor {
             config::Body::Convolution => Body::Convolution(PointUNet::new(config, device)),
         };
         Self { scale, body, config: config.clone() }
-    }
-
-    /// The transformer.
-    ///
-    /// # Panics
-    /// If the body is a convolution.
-    pub fn transformer(&self) -> &Dust3r {
-        let Body::Transformer(net) = &self.body else { panic!("the body is a convolution") };
-        net
     }
 
     /// The same network without the layers of the unseen sides.
@@ -186,8 +178,7 @@ impl PointPredictor {
         self.views().len() > 2 && self.config.sides == Sides::Predicted
     }
 
-    /// Whether the layer of this name in a checkpoint is a last one: its output is the raw points, which only activations
-    /// follow.
+    /// Whether the layer of this name in a checkpoint outputs the raw points.
     pub(crate) fn is_last_layer(&self) -> fn(&str) -> bool {
         match &self.body {
             Body::Transformer(_) => Dust3r::is_last_layer,
@@ -200,12 +191,12 @@ impl PointPredictor {
         self.scale.val()
     }
 
-    /// Expanded, so that δ's gradient is a sum over one dimension after the other, not over all at once.
+    /// `x` times δ. δ is expanded, so that its gradient is summed over one dimension after the other.
     fn times_delta(&self, x: Tensor<4>) -> Tensor<4> {
         x.clone() * self.delta().reshape([1; 4]).expand(x.dims())
     }
 
-    /// Enlarges a map `factor` times, from the network's pixels to those of the canvas, and multiplies its points by δ
+    /// Enlarges a map `factor` times, from network pixels to canvas pixels, and multiplies its points by δ
     /// (docs/method.md, "Enlargement and delta").
     ///
     /// `weights` `[B, 1, H, W]` ≥ 0 are the person's share of each network pixel, for `mask-aware` interpolation.
@@ -223,7 +214,7 @@ impl PointPredictor {
         let plain = up(points.clone());
         let points = match (method, weights) {
             (Upsample::MaskAware, Some(weights)) if factor > 1 => {
-                /// A canvas pixel with less of the person than this around it keeps the plain interpolation.
+                /// Canvas pixels with a smaller interpolated weight keep the plain interpolation.
                 const MIN_WEIGHT: f64 = 1e-4;
                 let total = up(weights.clone());
                 // Points of the background may be anything, an overflow included.
@@ -254,9 +245,9 @@ impl PointPredictor {
         }
     }
 
-    /// Enlarges a head's map to the canvas pixels of the `window` that the network received, and adds the anchors. Points
-    /// are then metres in the front camera's frame. `mask` `[B, 1, S, S]` is the photograph's. Sides have none; their mask
-    /// is the predicted confidence above the threshold, without a gradient.
+    /// Enlarges a head's map to the canvas pixels of the `window` that the network received, and adds the anchors.
+    /// Points are then metres in the front camera's frame. `mask` `[B, 1, S, S]` is the photograph's mask. Sides have
+    /// no mask: their person is where the predicted confidence exceeds the threshold, without a gradient.
     pub fn finished(
         &self,
         config: &Config,
@@ -279,7 +270,7 @@ impl PointPredictor {
     /// The encoder: a transformer reads each photograph alone, a convolution both together.
     pub fn encode(&self, Input { images, grid }: Input) -> Encoded {
         match &self.body {
-            Body::Transformer(net) => Encoded::Tokens(net.encode(images, &grid), grid),
+            Body::Transformer(net) => Encoded::Tokens(net.encode(images, grid), grid),
             Body::Convolution(net) => {
                 let b = images.dims()[0] / 2;
                 let (front, back) = (images.clone().narrow(0, 0, b), images.narrow(0, b, b));
@@ -290,25 +281,25 @@ impl PointPredictor {
 
     /// The decoder, which joins both photographs.
     pub fn decode(&self, encoded: Encoded) -> Decoded {
-        match encoded {
-            Encoded::Tokens(tokens, grid) => {
+        match (&self.body, encoded) {
+            (Body::Transformer(net), Encoded::Tokens(tokens, grid)) => {
                 let b = tokens.dims()[0] / 2;
                 let (front, back) = (tokens.clone().narrow(0, 0, b), tokens.narrow(0, b, b));
-                Decoded::Tokens(self.transformer().decode(front, back, &grid), grid)
+                Decoded::Tokens(net.decode(front, back, grid), grid)
             }
-            Encoded::Levels(levels) => {
-                let Body::Convolution(net) = &self.body else { panic!("encoded by another network") };
+            (Body::Convolution(net), Encoded::Levels(levels)) => {
                 let features = net.features(&levels);
                 Decoded::Levels(levels, features)
             }
+            _ => panic!("encoded by another network"),
         }
     }
 
-    /// Raw x, y, z, confidence `[B, 4, h, w]` of [`Self::views`], before their activation. Completed sides are left out.
+    /// Raw x, y, z, confidence `[B, 4, h, w]` of [`Self::views`] before activation, without completed sides.
     pub fn raw(&self, decoded: &Decoded) -> Vec<Tensor<4>> {
         match (&self.body, decoded) {
             (Body::Transformer(net), Decoded::Tokens(maps, grid)) => {
-                self.views().iter().map(|view| net.raw_points(*view, maps, grid)).collect()
+                self.views().iter().map(|view| net.raw_points(*view, maps, *grid)).collect()
             }
             (Body::Convolution(net), Decoded::Levels(levels, features)) => net
                 .photographed(features.clone())
@@ -319,8 +310,8 @@ impl PointPredictor {
         }
     }
 
-    /// Activated maps at the network's resolution, in network units and without anchors. With `network.both_ways`, the batch
-    /// of `decoded` is twice that of the result. Completed sides are left out ([`Self::complete`]).
+    /// Activated maps at the network's resolution, in network units, without anchors and without completed sides
+    /// ([`Self::complete`]). With `network.both_ways`, the batch of `decoded` is twice the batch of the result.
     pub fn heads(&self, decoded: &Decoded) -> Vec<(View, PointMap)> {
         let raw = self.raw(decoded);
         let map = |(&view, raw): (&View, Tensor<4>)| {
@@ -332,15 +323,8 @@ impl PointPredictor {
         if self.config.both_ways { mean_with_mirrored(&maps) } else { maps }
     }
 
-    /// The network of completed sides.
-    #[cfg(test)]
-    pub(super) fn completion(&self) -> Option<&super::completion::Completion> {
-        let Body::Convolution(net) = &self.body else { return None };
-        net.completion()
-    }
-
-    /// Appends the maps of completed sides to those of front and back, in network units and without anchors. `images` are
-    /// those of the input, of the `window` of the canvas. Without completed sides, the maps stay as they are.
+    /// Appends the maps of completed sides to the maps of front and back, in network units and without anchors.
+    /// `images` are the input's images of the `window`. Without completed sides, the maps stay as they are.
     pub fn complete(
         &self,
         mut maps: Vec<(View, PointMap)>,
@@ -351,7 +335,7 @@ impl PointPredictor {
         let (Body::Convolution(net), Decoded::Levels(levels, features)) = (&self.body, decoded) else {
             return maps;
         };
-        let Some(completion) = net.completion() else { return maps };
+        let Some(completion) = &net.completion else { return maps };
         let config = &self.config;
         let window = window.shrunk(config.resolution / config.net_resolution);
         let b = maps[0].1.conf.dims()[0];

@@ -4,16 +4,16 @@ use burn::tensor::Tensor;
 use glam::DVec3;
 
 use super::View;
-use super::anchor::nominal;
+use super::rays::nominal;
 use crate::config::OPPOSITE;
-use crate::crop::Window;
-use snapsnap_ops::rows::NONE;
+use crate::window::Window;
+use snapsnap_ops::gather::NONE;
 
-/// A point that lies so far behind the nearest, in metres, is of another limb.
+/// A point that lies this many metres or more behind the nearest point belongs to another limb.
 const APART: f64 = 0.05;
 
-/// For every pixel of a side, the nearest of N points, the nearest of those that are [`APART`] behind it, and the farthest:
-/// `[B·h·w]` rows of a table of N rows for each sample, or [`NONE`].
+/// For every pixel of a side: its nearest point, the nearest of the points at least [`APART`] behind it, and its
+/// farthest point, as `[B·h·w]` rows of a table of N points for each sample, or [`NONE`].
 pub struct Visible {
     pub nearest: Vec<i32>,
     pub second: Vec<i32>,
@@ -21,8 +21,8 @@ pub struct Visible {
 }
 
 impl Visible {
-    /// `points` `[B, N, 3]`, metres in the front camera's frame, as the camera of `view` sees them in a window of a canvas of
-    /// `side`² pixels. Points that are not `inside` `[B, N]` are left out.
+    /// Projects `points` `[B, N, 3]`, metres in the front camera's frame, into the camera of `view`, in a window of a
+    /// canvas of `side`² pixels. Points whose `inside` `[B, N]` is below ½ are left out.
     pub fn new(
         view: View,
         side: usize,
@@ -48,7 +48,7 @@ impl Visible {
             };
             let of_person = points.chunks_exact(3).enumerate().filter(|(i, _)| inside[*i] >= 0.5);
             let seen: Vec<(usize, f64, i32)> = of_person.filter_map(seen).collect();
-            // The first of all points with the smallest distance beyond `from`.
+            // By pixel, the point with the smallest `distance` of all points at a depth of `from` or more.
             let nearest = |from: &dyn Fn(usize) -> f64, distance: fn(f64) -> f64| {
                 let mut best = vec![(f64::INFINITY, NONE); area];
                 for &(pixel, depth, row) in &seen {
@@ -103,8 +103,8 @@ mod tests {
         let device = Device::flex();
         let window = Window { rows: 8..56, columns: 16..48 };
         for view in [View::Right, View::Left] {
-            // Five points of a pixel, of which one is no person's and two are of one surface; a point beside the window; one
-            // behind the camera; one that is no point.
+            // Five points of a pixel, of which one lies outside of the person and two on one surface; a point beside
+            // the window; a point behind the camera; a point that is not finite.
             let mut points = seen(
                 view,
                 &[

@@ -5,7 +5,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use glam::DVec3;
 use snapsnap_splat::{Camera, RigidTransform};
 
-use crate::config::{RegressorColor, RegressorConfig, RegressorStart};
+use crate::config::RegressorConfig;
 
 /// Gaussian attributes of N pixels.
 #[derive(Debug, Clone)]
@@ -16,7 +16,7 @@ pub struct Attributes {
     pub scale: Tensor<2>,
     /// Unit quaternions `[N, 4]` (w, x, y, z).
     pub rotation: Tensor<2>,
-    /// `[N, 3]`, −1 black, 1 white. Corrected colours of pixels may lie beyond.
+    /// `[N, 3]`, −1 black, 1 white. Corrected pixel colours may lie outside of this range.
     pub color: Tensor<2>,
     /// Offsets from the point map `[N, 3]`, metres, front camera's axes.
     pub offset: Tensor<2>,
@@ -43,33 +43,27 @@ pub struct Limits {
 }
 
 impl Limits {
-    /// Those of both photographs (`pair` 0) or of the sides.
+    /// The limits of both photographs (`pair` 0) or of the sides.
     pub fn of(config: &RegressorConfig, pair: usize) -> Self {
         let pair = pair.min(1);
         // Colours are in [−1, 1].
-        Self { color: 2.0 * config.color_limits()[pair], opacity: config.least_opacities()[pair] }
+        Self { color: 2.0 * config.color_limits[pair], opacity: config.least_opacities[pair] }
     }
 }
 
-/// Standard deviation of a Gaussian at the start over the distance of its neighbours. (Rendered at right angles, true
+/// Initial standard deviation of a Gaussian over the distance of its neighbours. (Rendered at right angles, true
 /// points reach 23.3 dB with 0.2 and 22.3 dB with 0.4. The smaller value shows holes in close views.)
 const START_SCALE: f64 = 0.3;
-/// Opacity at the start, as the logit of 0.9.
+/// Initial opacity, as the logit of 0.9.
 const START_OPACITY: f64 = 2.197_224_577_336_219;
-/// The network changes a scale by up to this factor's logarithm.
+/// The network changes the logarithm of a scale by at most this value.
 const LOG_SCALE: f64 = 2.0;
-/// Largest distance of a point from its neighbours, relative to the width of a pixel there. Points beyond are on another
-/// limb.
+/// Largest distance between neighbouring points, in pixel widths. Points farther apart are on different limbs.
 const MOST_SPACING: f32 = 3.0;
 
 impl Geometry {
-    /// Whether a config uses it.
-    pub fn is_needed(config: &RegressorConfig) -> bool {
-        config.start() == RegressorStart::Geometric || config.color() == RegressorColor::Residual
-    }
-
-    /// The geometry of the valid pixels of a view, row by row, from colours `[3, S, S]` and points `[S, S, 3]`. The world of its
-    /// `camera` is the frame of the points.
+    /// The geometry of a view's valid pixels, row by row, from colours `[3, S, S]` and points `[S, S, 3]`. The world
+    /// of `camera` is the frame of the points.
     pub fn new(
         image: &[f32],
         points: &[f32],
@@ -113,31 +107,24 @@ impl Geometry {
 }
 
 impl Attributes {
-    /// Attributes of features `[N, 14]`, relative to the `geometry` if the config uses it.
-    pub fn new(config: &RegressorConfig, features: Tensor<2>, geometry: Option<Geometry>) -> Self {
+    /// Attributes of features `[N, 14]`: corrections of the `geometry`, if there is one.
+    pub fn new(features: Tensor<2>, geometry: Option<Geometry>) -> Self {
         let Some(Geometry { spacing, colors, limits }) = geometry else {
             return Self::from_features(features);
         };
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
-        let color = match config.color() {
-            RegressorColor::Free => part(8, 3).tanh(),
-            // Small corrections are the same for every limit.
-            RegressorColor::Residual => colors + (part(8, 3) / limits.color).tanh() * limits.color,
-        };
-        if config.start() == RegressorStart::Published {
-            return Self { color, ..Self::from_features(features.clone()) };
-        }
         let upright = Tensor::from_data([[1.0, 0.0, 0.0, 0.0]], &features.device());
         Self {
             opacity: sigmoid(part(0, 1) + START_OPACITY) * (1.0 - limits.opacity) + limits.opacity,
             scale: (part(1, 3).tanh() * LOG_SCALE).exp() * (spacing.clone() * START_SCALE),
             rotation: unit(part(4, 4) + upright),
-            color,
+            // Small corrections are the same for every limit.
+            color: colors + (part(8, 3) / limits.color).tanh() * limits.color,
             offset: part(11, 3) * spacing,
         }
     }
 
-    /// Those of several parts, one part after the other.
+    /// The attributes of several parts, one part after the other.
     pub fn joined(parts: Vec<Self>) -> Self {
         let join =
             |of: fn(&Self) -> &Tensor<2>| Tensor::cat(parts.iter().map(|part| of(part).clone()).collect(), 0);
@@ -163,7 +150,7 @@ impl Attributes {
     }
 }
 
-/// 0.001·ln(1 + e^(100·x)), written so that no exponential overflows: 0.1·max(x, 0) + 0.001·ln(1 + e^(−100·|x|)).
+/// 0.001·ln(1 + e^(100·x)) without overflow, as 0.1·max(x, 0) + 0.001·ln(1 + e^(−100·|x|)).
 /// PyTorch's softplus switches to the straight line above 100·x = 20, where the two differ by 2e-9 of 20.
 fn sharp_softplus(x: Tensor<2>) -> Tensor<2> {
     x.clone().clamp_min(0.0) * 0.1 + (x.abs() * -100.0).exp().log1p() * 0.001
@@ -197,77 +184,45 @@ mod tests {
         }
     }
 
-    /// At zero output the colour is grey or the pixel's, for every start of the other attributes.
-    #[test]
-    fn colours_are_the_networks_or_corrections_of_the_pixels() {
+    /// Attributes of one Gaussian on a pixel of the colour (0.5, −0.25, 1). All features but one are 0.
+    fn attributes(channel: usize, feature: f32, limits: Limits) -> Attributes {
         let device = Device::flex();
+        let mut features = [0.0; 14];
+        features[channel] = feature;
         let geometry = Geometry {
             spacing: Tensor::from_data([[0.01]], &device),
             colors: Tensor::from_data([[0.5, -0.25, 1.0]], &device),
-            limits: Limits { color: 1.0, opacity: 0.0 },
+            limits,
         };
-        let of = |start, color| {
-            let config = RegressorConfig { start, color, ..RegressorConfig::default() };
-            let geometry = Geometry::is_needed(&config).then(|| geometry.clone());
-            let made = Attributes::new(&config, Tensor::zeros([1, 14], &device), geometry);
-            (values(made.color), values(made.scale)[0])
-        };
-        let (geometric, published) = (Some(RegressorStart::Geometric), Some(RegressorStart::Published));
-        let (free, residual) = (Some(RegressorColor::Free), Some(RegressorColor::Residual));
-        let (pixel, grey) = (vec![0.5, -0.25, 1.0], vec![0.0; 3]);
-        assert_eq!(of(geometric, None), of(geometric, residual));
-        assert_eq!(of(None, None), of(published, free));
-        assert_eq!((of(geometric, residual).0, of(geometric, free).0), (pixel.clone(), grey.clone()));
-        assert_eq!((of(published, residual).0, of(published, free).0), (pixel, grey));
-        assert_eq!(of(geometric, free).1, of(geometric, residual).1);
-        assert_eq!(of(published, free).1, of(published, residual).1);
-        assert_ne!(of(published, free).1, of(geometric, free).1);
+        Attributes::new(Tensor::from_data([features], &device), Some(geometry))
     }
 
-    /// A small correction is the network's for any limit. A large one ends at the limit.
+    #[test]
+    fn without_corrections_colours_are_the_pixels() {
+        let made = attributes(8, 0.0, Limits { color: 1.0, opacity: 0.0 });
+        assert_eq!(values(made.color), [0.5, -0.25, 1.0]);
+    }
+
+    /// A small correction is the same for any limit. A large correction ends at the limit.
     #[test]
     fn corrections_of_colours_end_at_their_limit() {
-        let device = Device::flex();
-        let color = |feature: f32, color_limit: f64| {
-            let mut features = [0.0; 14];
-            features[8] = feature;
-            let config =
-                RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
-            let geometry = Geometry {
-                spacing: Tensor::from_data([[0.01]], &device),
-                colors: Tensor::from_data([[0.5, -0.25, 1.0]], &device),
-                limits: Limits { color: color_limit, opacity: 0.0 },
-            };
-            values(Attributes::new(&config, Tensor::from_data([features], &device), Some(geometry)).color)[0]
-        };
         for limit in [0.06, 0.2, 1.0] {
-            assert!((color(0.01, limit) - 0.51).abs() < 1e-4, "{limit}");
+            let color =
+                |feature| values(attributes(8, feature, Limits { color: limit, opacity: 0.0 }).color)[0];
+            assert!((color(0.01) - 0.51).abs() < 1e-4, "{limit}");
             for sign in [-1.0, 1.0] {
-                assert!((color(sign * 30.0, limit) - 0.5 - sign * limit as f32).abs() < 1e-6, "{limit}");
+                assert!((color(sign * 30.0) - 0.5 - sign * limit as f32).abs() < 1e-6, "{limit}");
             }
         }
     }
 
     #[test]
     fn opacities_end_at_their_least_value() {
-        let device = Device::flex();
-        let opacity = |feature: f32, least: f64| {
-            let mut features = [0.0; 14];
-            features[0] = feature;
-            let config =
-                RegressorConfig { start: Some(RegressorStart::Geometric), ..RegressorConfig::default() };
-            let geometry = Geometry {
-                spacing: Tensor::from_data([[0.01]], &device),
-                colors: Tensor::from_data([[0.0; 3]], &device),
-                limits: Limits { color: 1.0, opacity: least },
-            };
-            values(Attributes::new(&config, Tensor::from_data([features], &device), Some(geometry)).opacity)
-                [0]
-        };
         for (feature, least, expected) in
             [(0.0, 0.0, 0.9), (0.0, 0.8, 0.98), (-40.0, 0.8, 0.8), (40.0, 0.8, 1.0), (-40.0, 1.0, 1.0)]
         {
-            assert!((opacity(feature, least) - expected).abs() < 1e-6, "{feature}, {least}");
+            let opacity = values(attributes(0, feature, Limits { color: 1.0, opacity: least }).opacity)[0];
+            assert!((opacity - expected).abs() < 1e-6, "{feature}, {least}");
         }
     }
 

@@ -1,4 +1,4 @@
-//! The regressor on `flex`: one operator with a gradient of its own, over all parameters as one vector.
+//! The regressor on `flex`: one operator with its own backward pass, whose parameters are one vector.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -6,13 +6,13 @@ use std::sync::{Arc, Mutex, PoisonError};
 use burn::module::Param;
 use burn::nn::conv::Conv2d;
 use burn::tensor::{Tensor, TensorData};
-use snapsnap_ops::conv::{Layer, Wanted};
+use snapsnap_ops::fused::{GroupStatistics, Needed};
 use snapsnap_ops::op::{self, Kept, Kernel};
-use snapsnap_ops::unet::{FEATURES, Network, Saved};
+use snapsnap_ops::regressor::{FEATURES, Network, Saved};
 
 use super::statistics::Statistics;
-use super::unet::UNet;
-use crate::names::{NamedVisitor, ParameterPath, visit_named};
+use super::unet::{GROUPS, UNet};
+use crate::parameters::{NamedVisitor, ParameterPath, visit_named};
 
 /// One pass of the network.
 #[derive(Debug)]
@@ -20,9 +20,9 @@ struct Pass {
     network: Network,
     /// B, H, W.
     size: [usize; 3],
-    frozen: Option<Vec<Layer>>,
+    frozen: Option<Vec<GroupStatistics>>,
     /// Statistics that the forward pass measured.
-    measured: Arc<Mutex<Vec<Layer>>>,
+    measured: Arc<Mutex<Vec<GroupStatistics>>>,
 }
 
 impl Kernel for Pass {
@@ -45,7 +45,7 @@ impl Kernel for Pass {
         [wants_input, wants_parameters, _]: [bool; 3],
     ) -> [Option<Vec<f32>>; 3] {
         let saved = kept.and_then(|kept| kept.downcast::<Saved>().ok()).expect("kept by the forward pass");
-        let wanted = Wanted { input: wants_input, parameters: wants_parameters };
+        let wanted = Needed { input: wants_input, parameters: wants_parameters };
         let gradients = self.network.backward(parameters, input, *saved, upstream, wanted);
         [wants_input.then_some(gradients.input), wants_parameters.then_some(gradients.parameters), None]
     }
@@ -87,7 +87,7 @@ fn flat(unet: &UNet, last: &Conv2d) -> (Network, Tensor<1>) {
     let mut collect = Collect::default();
     visit_named(unet, "", &mut collect);
     visit_named(last, "gs_conv.", &mut collect);
-    let network = Network::new(unet.groups(), &collect.shapes);
+    let network = Network::new(GROUPS, &collect.shapes);
     let mut values = |name: &str| collect.values.remove(name).expect("the layout names existing parameters");
     let flat = Tensor::cat(network.tensors().iter().map(|tensor| values(&tensor.name)).collect(), 0);
     (network, flat)

@@ -16,15 +16,9 @@ use snapsnap_ops::layers::conv2d;
 
 pub use crate::config::RECEPTIVE_RADIUS;
 pub use attributes::{Attributes, Geometry, Limits};
+pub use snapsnap_ops::regressor::{FEATURES, INPUT_CHANNELS};
 pub use statistics::Statistics;
 pub use unet::UNet;
-
-use crate::config::RegressorConfig;
-
-/// Channels in: red, green, blue in [−1, 1], then x, y, z in metres (front camera's frame).
-pub const INPUT_CHANNELS: usize = 6;
-/// Channels out: opacity 1, scale 3, rotation 4, colour 3, offset 3.
-pub const FEATURES: usize = 14;
 
 /// UNet and final 1×1 convolution. Field names are the checkpoint's.
 #[derive(Module, Debug)]
@@ -35,9 +29,9 @@ pub struct Regressor {
 
 impl Regressor {
     /// A regressor without values for its parameters yet.
-    pub fn new(config: &RegressorConfig, device: &Device) -> Self {
+    pub fn new(device: &Device) -> Self {
         Self {
-            pred_unet: UNet::new(config, device),
+            pred_unet: UNet::new(device),
             gs_conv: Conv2dConfig::new([FEATURES, FEATURES], [1, 1])
                 .with_padding(PaddingConfig2d::Valid)
                 .init(device),
@@ -51,8 +45,7 @@ impl Regressor {
         let [_, channels, h, w] = input.dims();
         assert_eq!(channels, INPUT_CHANNELS, "regressor input must be [B, {INPUT_CHANNELS}, H, W]");
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
-        let has_kernel = snapsnap_ops::has_kernels(&input);
-        if has_kernel && self.pred_unet.suits_cpu_kernel() {
+        if snapsnap_ops::has_kernels(&input) {
             return kernel::regress(&self.pred_unet, &self.gs_conv, input, statistics);
         }
         conv2d(&self.gs_conv, self.pred_unet.forward(input, statistics), false).permute([0, 2, 3, 1])

@@ -32,14 +32,14 @@ impl Statistics {
         Some(self.layers.iter().map(|[mean, rstd]| [host(mean), host(rstd)]).collect())
     }
 
-    /// Adds the measured statistics of a whole pass; frozen ones stay as they are.
+    /// Adds the measured statistics of a whole pass. Frozen statistics stay as they are.
     pub(crate) fn record(&mut self, layers: impl Iterator<Item = [Tensor<2>; 2]>) {
         if self.next.is_none() {
             self.layers.extend(layers);
         }
     }
 
-    /// Mean and reciprocal standard deviation `[B, groups]` of the next layer: frozen, or from `measure`.
+    /// Means and reciprocal standard deviations `[B, groups]` of the next layer: frozen, or from `measure`.
     pub(crate) fn layer(&mut self, measure: impl FnOnce() -> [Tensor<2>; 2]) -> [Tensor<2>; 2] {
         match &mut self.next {
             Some(next) => {

@@ -1,4 +1,4 @@
-//! The UNet of the regressor (docs/method.md, "UNet"): two halvings, residual blocks with group normalisation, no attention.
+//! The regressor's UNet (docs/method.md, "UNet"): two halvings, residual blocks, group normalisation, no attention.
 //!
 //! Field names are the checkpoint's.
 
@@ -7,14 +7,15 @@ use burn::nn::conv::{Conv2d, Conv2dConfig};
 use burn::nn::{GroupNorm, GroupNormConfig, PaddingConfig2d};
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Tensor};
+use snapsnap_ops::fused::CHANNELS;
 use snapsnap_ops::layers::conv2d;
+use snapsnap_ops::regressor::{BRANCH_SCALE, LEVELS};
 
 use super::statistics::{Statistics, normalise};
 use super::{FEATURES, INPUT_CHANNELS};
-use crate::config::RegressorConfig;
 
-/// Factor of every sum of two branches, which keeps its variance.
-pub(crate) const BRANCH_SCALE: f64 = std::f64::consts::FRAC_1_SQRT_2;
+/// Groups of every group normalisation.
+pub(super) const GROUPS: usize = 16;
 
 fn conv3x3(from: usize, to: usize, stride: usize, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [3, 3])
@@ -34,15 +35,14 @@ pub(crate) struct ResBlock {
 }
 
 impl ResBlock {
-    fn new(from: usize, config: &RegressorConfig, device: &Device) -> Self {
-        let to = config.channels;
-        let shortcut = Conv2dConfig::new([from, to], [1, 1]).with_padding(PaddingConfig2d::Valid);
+    fn new(from: usize, device: &Device) -> Self {
+        let shortcut = Conv2dConfig::new([from, CHANNELS], [1, 1]).with_padding(PaddingConfig2d::Valid);
         Self {
-            norm1: GroupNormConfig::new(config.groups, from).init(device),
-            conv1: conv3x3(from, to, 1, device),
-            norm2: GroupNormConfig::new(config.groups, to).init(device),
-            conv2: conv3x3(to, to, 1, device),
-            shortcut: (from != to).then(|| shortcut.init(device)),
+            norm1: GroupNormConfig::new(GROUPS, from).init(device),
+            conv1: conv3x3(from, CHANNELS, 1, device),
+            norm2: GroupNormConfig::new(GROUPS, CHANNELS).init(device),
+            conv2: conv3x3(CHANNELS, CHANNELS, 1, device),
+            shortcut: (from != CHANNELS).then(|| shortcut.init(device)),
         }
     }
 
@@ -85,13 +85,10 @@ pub struct UNet {
     pub(crate) conv_out: Conv2d,
 }
 
-/// Levels of the UNet.
-const LEVELS: usize = 3;
-
 impl UNet {
-    pub(crate) fn new(config: &RegressorConfig, device: &Device) -> Self {
-        let c = config.channels;
-        let blocks = |n: usize, from: usize| (0..n).map(|_| ResBlock::new(from, config, device)).collect();
+    pub(crate) fn new(device: &Device) -> Self {
+        let c = CHANNELS;
+        let blocks = |n: usize, from: usize| (0..n).map(|_| ResBlock::new(from, device)).collect();
         Self {
             conv_in: conv3x3(INPUT_CHANNELS, c, 1, device),
             down_blocks: (0..LEVELS)
@@ -107,19 +104,9 @@ impl UNet {
                     upsample: (level + 1 < LEVELS).then(|| conv3x3(c, c, 1, device)),
                 })
                 .collect(),
-            norm_out: GroupNormConfig::new(config.groups, c).init(device),
+            norm_out: GroupNormConfig::new(GROUPS, c).init(device),
             conv_out: conv3x3(c, FEATURES, 1, device),
         }
-    }
-
-    /// Groups of every normalisation.
-    pub(crate) fn groups(&self) -> usize {
-        self.norm_out.num_groups
-    }
-
-    /// Whether the fused CPU kernel has this width.
-    pub(crate) fn suits_cpu_kernel(&self) -> bool {
-        self.norm_out.num_channels == snapsnap_ops::conv::CHANNELS
     }
 
     /// `[B, 6, H, W]`, H and W multiples of 4 → `[B, 14, H, W]`.

@@ -20,8 +20,8 @@ pub type Progress<'a> = &'a dyn Fn(u64, u64);
 
 /// Largest number of keys that a message names.
 const MAX_DIFFERENCES: usize = 3;
-/// Keys that change what the point predictor's tensors mean, but not which there are.
-const POINTS: [&str; 9] = [
+/// Keys that change the meaning of the point predictor's tensors, but not the set of tensors.
+const POINTS: [&str; 8] = [
     "network.anchor",
     "network.conf_mode",
     "network.dec_heads",
@@ -30,16 +30,14 @@ const POINTS: [&str; 9] = [
     "network.hooks",
     "network.mirror",
     "network.pair_degrees",
-    "network.rope_base",
 ];
-/// The same of the regressor.
-const GAUSSIANS: [&str; 4] =
-    ["mode.rotation_frame", "regressor.color", "regressor.groups", "regressor.start"];
+/// Keys that change the meaning of the regressor's tensors.
+const GAUSSIANS: [&str; 2] = ["mode.rotation_frame", "regressor.start"];
 /// Values per task: a second-level cache holds them.
 const CHUNK: usize = 1 << 16;
 
-/// Writes `tensors` in order. `values` returns one at a time, so that only one is in memory. Values that are not finite are
-/// an error that names all their tensors, as `origin`'s, and no file is written.
+/// Writes `tensors` in order. `values` returns one tensor at a time, so that only one is in memory. If values are not
+/// finite, the error names all their tensors and `origin`, and no file is written.
 pub(super) fn write(
     path: &Path,
     origin: &str,
@@ -52,28 +50,16 @@ pub(super) fn write(
     let infos = tensors.iter().map(|t| (t.name.clone(), t.shape.clone()));
     // One entry only: the header lists metadata in no fixed order, and the same seed must give the same bytes.
     let metadata = HashMap::from([(CONFIG_KEY.into(), config.to_toml())]);
-    write_floats(path, origin, metadata, infos.collect(), float, |i| values(&tensors[i]), progress)
+    write_tensors(path, origin, metadata, infos.collect(), float, |i| values(&tensors[i]), progress)
 }
 
-/// Writes f32 tensors, by names and shapes, in order; `values` returns one at a time. `metadata` of more than one entry has
-/// no fixed order.
+/// Writes tensors, by names and shapes, in order; `values` returns one at a time. They are rounded to the type `float`.
+/// The order of `metadata` in the file is not fixed.
 ///
 /// # Errors
-/// [`WeightsError`] of `values`, for values that are not finite, which are named as `origin`'s, or if the file cannot be
+/// [`WeightsError`] of `values`, for values that are not finite (with the name `origin`), or if the file cannot be
 /// written. The former file then stays.
 pub fn write_tensors(
-    path: &Path,
-    origin: &str,
-    metadata: HashMap<String, String>,
-    tensors: Vec<(String, Vec<usize>)>,
-    values: impl FnMut(usize) -> Result<Vec<f32>, WeightsError>,
-    progress: Progress,
-) -> Result<(), WeightsError> {
-    write_floats(path, origin, metadata, tensors, Float::F32, values, progress)
-}
-
-/// [`write_tensors`] in a type of numbers, to the nearest of which values are rounded.
-fn write_floats(
     path: &Path,
     origin: &str,
     metadata: HashMap<String, String>,
@@ -110,10 +96,9 @@ fn write_floats(
         let mut written = 0;
         let mut problems = Vec::new();
         for (i, name) in names.iter().enumerate() {
-            // Values beyond the range of 16 bits become infinite.
-            let values = float.rounded(values(i).map_err(Failure::Weights)?);
-            problems.extend(not_finite(name, &values));
-            let bytes = float.bytes(&values);
+            let bytes = float.bytes(&values(i).map_err(Failure::Weights)?);
+            // Values beyond the range of 16 bits are infinite now.
+            problems.extend(not_finite(name, &float.widened(&bytes)));
             out.write_all(&bytes)?;
             written += bytes.len();
             progress(written as u64, at as u64);
@@ -129,8 +114,8 @@ fn write_floats(
     })
 }
 
-/// Writes the values of parameters, by names and layouts of checkpoints, as a weight file of `config`. Values of only one
-/// part make a file of that part.
+/// Writes the values of parameters, with the names and layouts of checkpoints, as a weight file of `config`. Values
+/// of only one part make a file of that part.
 ///
 /// # Errors
 /// [`WeightsError::File`], or [`WeightsError::Tensors`] for values that are not finite.
@@ -172,7 +157,7 @@ impl WeightFile {
         Self::checked(Source::open(path)?, config)
     }
 
-    /// The same of a safetensors file that is part of the program; `name` stands for its path.
+    /// Opens a safetensors file that is part of the program; `name` stands for its path.
     ///
     /// # Errors
     /// As [`Self::open`].
@@ -213,8 +198,8 @@ impl WeightFile {
         Err(WeightsError::Tensors { origin, problems })
     }
 
-    /// Refuses weights whose file contains a config in which the tensors of this part mean something else, such as points without
-    /// the anchors of this config. A file without a config or without this part passes.
+    /// Refuses weights whose file contains a config in which the tensors of this part mean something else, such as
+    /// points without the anchors of this config. A file without a config or without this part passes.
     ///
     /// # Errors
     /// [`WeightsError::File`] that names the keys.
@@ -280,7 +265,7 @@ impl WeightFile {
     }
 }
 
-/// The refusal of weights with these differences from the config.
+/// The error for weights with these differences from the config.
 fn of_others(path: &Path, differences: Vec<(String, String)>) -> WeightsError {
     let shown: Vec<String> =
         differences.into_iter().take(MAX_DIFFERENCES).map(|(_, message)| message).collect();

@@ -24,9 +24,9 @@ pub struct ImportOptions<'a> {
     pub float: Float,
 }
 
-/// The config in the metadata of weight files: `[regressor]`, `mode.rotation_frame` and `mode.crop` of the first file with a config and a
-/// regressor, the rest of the first one with a config and a point predictor. What no such file has is of the first config. `None` if no
-/// file has a config.
+/// The config in the metadata of weight files: `[regressor]`, `mode.rotation_frame` and `mode.crop` of the first file
+/// with a config and a regressor, the rest of the first file with a config and a point predictor. If there is no such
+/// file, the first config counts. `None` if no file has a config.
 ///
 /// # Errors
 /// [`WeightsError`] for a file that is no checkpoint, or whose config is refused.
@@ -99,8 +99,8 @@ fn canonical(key: &str) -> String {
 /// Reads checkpoints of the authors, DUSt3R or CroCo, checks every tensor against `config` and writes one weight file.
 ///
 /// Each of the two parts (point predictor, regressor) must be complete or wholly absent, except that files without δ,
-/// without side heads or without any heads, as DUSt3R's and CroCo's are, get those from the config and the seed. Without
-/// `network.side_heads`, the tensors of the unseen sides are left out. Where both `from` and `options.fill` have a tensor, it is that of `from`.
+/// without side heads or without any heads (DUSt3R's, CroCo's) get these from the config and the seed. Without
+/// `network.side_heads`, tensors of the unseen sides are left out. Tensors of `from` win over `options.fill`.
 ///
 /// # Errors
 /// [`WeightsError`]; `to` is then left as it was.
@@ -119,7 +119,7 @@ pub fn import(
     let mut problems = Vec::new();
     let mut found = collect(&sources, &mut problems, &mut report)?;
     copy_decoder(&mut found, &mut report);
-    // DUSt3R's files lack δ and the side heads, CroCo's all heads; Snap-Snap's are complete, or damaged.
+    // DUSt3R's files lack δ and the side heads, CroCo's files all heads. Snap-Snap's files are complete, or damaged.
     let lacks_heads = !found.contains_key(SCALE);
     if let Some(fill) = &fill {
         let others = collect(slice::from_ref(fill), &mut problems, &mut report)?;
@@ -128,7 +128,13 @@ pub fn import(
         }
     }
     if !config.network.side_heads {
-        leave_out(&mut found, is_of_sides, "unseen sides are left out: `network.side_heads`", &mut report);
+        let all = found.len();
+        found.retain(|name, _| !is_of_sides(name));
+        if found.len() < all {
+            let count = all - found.len();
+            let why = "`network.side_heads` is false";
+            report.notes.push(format!("{count} tensors of the unseen sides are left out: {why}"));
+        }
     }
     let parts = parts_of(found.keys());
     let specs: Vec<_> = schema::tensors(config).into_iter().filter(|t| parts.contains(&t.part)).collect();
@@ -154,15 +160,6 @@ pub fn import(
     report.tensors = specs.len();
     report.parameters = specs.iter().map(TensorSpec::elements).sum();
     Ok(report)
-}
-
-/// Removes tensors that the config has no layers for.
-fn leave_out(found: &mut Found, is_of: fn(&str) -> bool, what: &str, report: &mut ImportReport) {
-    let all = found.len();
-    found.retain(|name, _| !is_of(name));
-    if found.len() < all {
-        report.notes.push(format!("{} tensors of the {what} is false", all - found.len()));
-    }
 }
 
 /// Whether the tensor belongs to the unseen sides alone.

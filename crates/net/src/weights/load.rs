@@ -10,8 +10,8 @@ use super::file::{WeightFile, not_finite};
 use super::init::draw;
 use super::schema::{self, Part, SIDE, TensorSpec};
 use crate::config::Config;
-use crate::names::{NamedMapper, ParameterPath, map_named};
 use crate::network::PointPredictor;
+use crate::parameters::{NamedMapper, ParameterPath, map_named};
 use crate::regressor::Regressor;
 
 impl WeightFile {
@@ -32,7 +32,7 @@ impl WeightFile {
         self.require(Part::Regressor)?;
         ["", SIDE][..self.config.regressor.networks]
             .iter()
-            .map(|prefix| self.fill(Regressor::new(&self.config.regressor, device), prefix, device))
+            .map(|prefix| self.fill(Regressor::new(device), prefix, device))
             .collect()
     }
 
@@ -51,7 +51,7 @@ pub fn random_predictor(config: &Config, seed: u64, device: &Device) -> PointPre
 pub fn random_regressors(config: &Config, seed: u64, device: &Device) -> Vec<Regressor> {
     ["", SIDE][..config.regressor.networks]
         .iter()
-        .map(|prefix| random(config, seed, prefix, Regressor::new(&config.regressor, device), device))
+        .map(|prefix| random(config, seed, prefix, Regressor::new(device), device))
         .collect()
 }
 

@@ -1,7 +1,7 @@
 //! Checkpoints: reading the authors' files, our own file format, and filling the networks from it.
 //!
-//! Our file is one `.safetensors` with the authors' keys (`scale`, `dust3r.*`, `pred_unet.*`, `gs_conv.*`) and this project's
-//! (`unet.*`, `side.*`), in one [`Float`] type, and the config as TOML in its metadata.
+//! Our file is one `.safetensors` with the authors' keys (`scale`, `dust3r.*`, `pred_unet.*`, `gs_conv.*`) and this
+//! project's keys (`unet.*`, `side.*`), in one [`Float`] type, and the config as TOML in its metadata.
 
 mod export;
 mod file;
@@ -14,7 +14,7 @@ mod source;
 use snapsnap_base::FileError;
 use snapsnap_base::config::ConfigError;
 
-pub use crate::names::{NamedMapper, NamedVisitor, ParameterPath, map_named, visit_named};
+pub use crate::parameters::{NamedMapper, NamedVisitor, ParameterPath, map_named, visit_named};
 pub use export::export;
 pub use file::{Progress, WeightFile, not_finite, save, write_tensors};
 pub use import::{ImportOptions, ImportReport, import, stored_config};

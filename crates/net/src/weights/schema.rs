@@ -3,10 +3,11 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
+use snapsnap_base::config::Removed;
 
-use crate::config::{Config, RegressorStart};
-use crate::names::{NamedVisitor, ParameterPath, visit_named};
+use crate::config::{Config, RegressorStart, Schema};
 use crate::network::PointPredictor;
+use crate::parameters::{NamedVisitor, ParameterPath, visit_named};
 use crate::regressor::Regressor;
 
 /// The part of a checkpoint that a tensor belongs to.
@@ -62,7 +63,7 @@ pub fn tensors(config: &Config) -> Vec<TensorSpec> {
     // The parameters of new modules have shapes but no memory yet.
     let mut tensors = list(&PointPredictor::new(&config.network, &device), "", Part::PointPredictor);
     for prefix in &["", SIDE][..config.regressor.networks] {
-        tensors.extend(list(&Regressor::new(&config.regressor, &device), prefix, Part::Regressor));
+        tensors.extend(list(&Regressor::new(&device), prefix, Part::Regressor));
     }
     for spec in &mut tensors {
         if spec.name == SCALE {
@@ -75,6 +76,20 @@ pub fn tensors(config: &Config) -> Vec<TensorSpec> {
         }
     }
     tensors
+}
+
+// Here, since the networks know the config, and not the other way round.
+impl Schema for Config {
+    const REMOVED: &'static [Removed] = &[Self::GONE];
+
+    fn contradicts(&self, key: &str, value: &str) -> bool {
+        key == "regressor.color"
+            && (value == "\"residual\"") != (self.regressor.start() == RegressorStart::Geometric)
+    }
+
+    fn refusal(&self) -> Option<(String, String)> {
+        self.refused(|| tensors(self).iter().map(TensorSpec::elements).sum())
+    }
 }
 
 /// Number of parameters of one part.

@@ -30,7 +30,7 @@ pub struct Source {
 /// Description of one tensor in the file.
 #[derive(Debug, Clone)]
 pub struct Entry {
-    /// Element type, that of safetensors in lower case (`f32`, `bf16`, `i64` …).
+    /// Element type, named as in safetensors but in lower case (`f32`, `bf16`, `i64` …).
     pub dtype: String,
     /// Extents, outermost first.
     pub shape: Vec<usize>,
@@ -126,8 +126,8 @@ impl Source {
                 FileError::unsuitable(path, format!("neither safetensors nor a PyTorch checkpoint: {e}"))
             })?
             .into_tensors();
-        // The weights of Snap-Snap are below `network`, those of DUSt3R and CroCo below `model`; optimiser states are beside
-        // them.
+        // The weights of Snap-Snap are below `network`, the weights of DUSt3R and CroCo below `model`, beside
+        // optimiser states.
         let wrapper =
             ["network.", "model."].into_iter().find(|w| all.keys().any(|k| k.starts_with(w))).unwrap_or("");
         let reader: BTreeMap<_, _> =
@@ -228,17 +228,7 @@ impl Float {
         }
     }
 
-    /// The nearest numbers of this type.
-    pub(super) fn rounded(self, values: Vec<f32>) -> Vec<f32> {
-        let round = match self {
-            Self::F32 => return values,
-            Self::F16 => |v: f32| f16::from_f32(v).to_f32(),
-            Self::Bf16 => |v: f32| bf16::from_f32(v).to_f32(),
-        };
-        values.into_iter().map(round).collect()
-    }
-
-    /// Numbers of this type, little-endian.
+    /// The nearest numbers of this type, little-endian.
     pub(super) fn bytes(self, values: &[f32]) -> Vec<u8> {
         match self {
             Self::F32 => values.iter().flat_map(|v| v.to_le_bytes()).collect(),
@@ -247,7 +237,7 @@ impl Float {
         }
     }
 
-    fn widened(self, bytes: &[u8]) -> Vec<f32> {
+    pub(super) fn widened(self, bytes: &[u8]) -> Vec<f32> {
         let mut values = vec![0.0; bytes.len() / self.size()];
         self.widen(bytes, &mut values);
         values
@@ -278,7 +268,7 @@ impl Float {
 /// Values that are read and widened at a time: few enough to stay in the second-level cache.
 const CHUNK: usize = 1 << 16;
 
-/// The values of one tensor, read by all cores. Most of the time goes into the first touch of fresh memory, so each page
+/// The values of one tensor, read by all cores. The first touch of fresh memory takes most of the time, so each page
 /// of the result is touched once, by the core that fills it.
 fn read_values(file: &File, entry: &Entry, kind: Float) -> io::Result<Vec<f32>> {
     let count = entry.len / kind.size();

@@ -1,4 +1,4 @@
-//! Other colours of a character's clothes and hair.
+//! Random colours for a character's clothes and hair.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use snapsnap_mesh::mesh::Mesh;
 use super::joints::Region;
 use crate::math::{sin_cos, smoothstep};
 
-/// What a texel shows.
+/// The part of the body on a texel.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Shown {
     Nothing,
@@ -23,18 +23,18 @@ enum Shown {
     Body,
 }
 
-/// A change of colours.
+/// A change of a colour.
 #[derive(Clone, Copy)]
 struct Change {
-    /// Turn of the hue.
+    /// Rotation of the hue.
     turn: Mat3,
     /// Exponent of the brightness.
     gamma: f32,
 }
 
 impl Change {
-    /// A change of colours around `mean`: the hue turns by up to `hue` degrees, and the brightness of the mean goes up to
-    /// `share` of the way to any other.
+    /// A random change around `mean`: the hue turns by up to `hue` degrees, and the brightness of `mean` goes the
+    /// share `share` of the way to a random brightness.
     fn draw(random: &mut ChaCha8Rng, mean: Vec3, hue: f32, share: f32) -> Self {
         let (sin, cos) = sin_cos((hue * random.random_range(-1.0..1.0_f32)).to_radians());
         // A rotation around the axis of greys.
@@ -68,7 +68,7 @@ pub fn vary(mesh: &mut Mesh, regions: &[Region], random: &mut ChaCha8Rng) {
 fn varied(texture: &RgbImage, shown: &[Shown], random: &mut ChaCha8Rng) -> RgbImage {
     let has = |what: Shown| shown.contains(&what);
     let mut changed = texture.clone();
-    // A texture of nothing but hair.
+    // Without hands and body it is a texture of hair.
     if has(Shown::Head) && !has(Shown::Hand) && !has(Shown::Body) {
         let change = Change::draw(random, mean(texture, shown, Shown::Head), 12.0, 0.5);
         changed.pixels_mut().for_each(|pixel| *pixel = bytes(change.apply(floats(pixel))));
@@ -99,10 +99,10 @@ fn varied(texture: &RgbImage, shown: &[Shown], random: &mut ChaCha8Rng) -> RgbIm
     changed
 }
 
-/// One in so many texels is looked at for the main colours.
+/// Every `STEP`-th texel is used to find the main colours.
 const STEP: usize = 7;
 
-/// Up to three main colours, which are unlike each other.
+/// Up to three main colours that differ from each other, by k-means.
 fn main_colors(colors: &[Vec3]) -> Vec<Vec3> {
     /// Least distance of two main colours.
     const APART: f32 = 0.2;
@@ -146,11 +146,11 @@ fn bytes(color: Vec3) -> Rgb<u8> {
     Rgb((color * 255.0).round().to_array().map(|c| c as u8))
 }
 
-/// What each texel of a texture shows, by the faces that it is on.
+/// The part of the body on each texel, from the faces that cover the texel.
 fn shown(mesh: &Mesh, texture: &Arc<RgbImage>, regions: &[Region]) -> Vec<Shown> {
     let (width, height) = (texture.width() as usize, texture.height() as usize);
     let mut shown = vec![Shown::Nothing; width * height];
-    // Texels of triangles that damaged files repeat or enlarge without end.
+    // Limits the work for repeated or huge triangles of damaged files.
     let mut budget = 64 * shown.len() as u64;
     for face in &mesh.faces {
         let own = mesh.materials[face.material as usize].texture.as_ref();
@@ -200,7 +200,7 @@ fn fill([a, b, c]: [Vec2; 3], budget: &mut u64, mut mark: impl FnMut(i64, i64)) 
     }
 }
 
-/// The mean colour of what shows `what`.
+/// The mean colour of the texels that show `what`.
 fn mean(texture: &RgbImage, shown: &[Shown], what: Shown) -> Vec3 {
     let those = texture.pixels().zip(shown).filter(|(_, shown)| **shown == what);
     let (sum, count) =
@@ -208,7 +208,7 @@ fn mean(texture: &RgbImage, shown: &[Shown], what: Shown) -> Vec3 {
     sum / f32::max(count, 1.0)
 }
 
-/// 0 for a colour like that of the skin, 1 for one unlike it, by the shares of the channels.
+/// 0 for a colour similar to `skin`, 1 for a different one, by the shares of the channels.
 fn unlike(color: Vec3, skin: Vec3) -> f32 {
     let shares = |c: Vec3| c / c.element_sum().max(0.02);
     smoothstep(0.09, 0.16, (shares(color) - shares(skin)).length())

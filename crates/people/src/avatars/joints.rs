@@ -1,10 +1,11 @@
-//! Joints of a character by their names.
+//! The skeleton of a character.
 
 use std::collections::HashMap;
 
 use glam::{Mat3, Quat, Vec3};
 use snapsnap_mesh::import;
 
+use crate::joint_names::{Name, find, known, need};
 use crate::math::rotate_y;
 use crate::skeleton::{Bone, Joint, Rest, hanging};
 
@@ -20,122 +21,27 @@ pub enum Region {
     Foot,
 }
 
-/// Joints that a character has, in the order from the hips to the ends.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-enum Name {
-    Hips,
-    Spine,
-    Neck,
-    Head,
-    Clavicle,
-    Shoulder,
-    UpperArm,
-    Forearm,
-    Hand,
-    /// A joint of the index, middle, ring or small finger, 2 to 5.
-    Finger(u8),
-    Thigh,
-    Calf,
-    Foot,
-    Toe,
-}
-
-/// What `name` calls, and its side, by the conventions of Mixamo (`mixamorig:LeftArm`) and MakeHuman (`upperarm01.L`,
-/// `upperarm_l`).
-fn known(name: &str) -> Option<(Name, usize)> {
-    let name = name.rsplit(':').next()?.to_lowercase();
-    let name = name.strip_prefix("mixamorig").unwrap_or(&name).trim_start_matches('_');
-    let side = |name: &str| -> (String, usize) {
-        for (side, word, letter) in [(0, "left", 'l'), (1, "right", 'r')] {
-            if let Some(rest) = name.strip_prefix(word) {
-                return (rest.to_owned(), side);
-            }
-            if let Some(rest) = name.strip_suffix(letter).and_then(|rest| rest.strip_suffix(['.', '_'])) {
-                return (rest.to_owned(), side);
-            }
-        }
-        (name.to_owned(), 0)
-    };
-    let (base, side) = side(name);
-    let stem = base.trim_end_matches(|c: char| c.is_ascii_digit() || c == '_' || c == '-');
-    let name = match stem {
-        "hips" | "pelvis" | "root" => Name::Hips,
-        "spine" => Name::Spine,
-        "neck" => Name::Neck,
-        "head" => Name::Head,
-        "clavicle" => Name::Clavicle,
-        // MakeHuman's shoulder01 lies between collarbone and arm, Mixamo's is the collarbone.
-        "shoulder" if base == "shoulder01" => Name::Shoulder,
-        "shoulder" => Name::Clavicle,
-        "arm" | "upperarm" => Name::UpperArm,
-        "forearm" | "lowerarm" => Name::Forearm,
-        "hand" | "wrist" => Name::Hand,
-        "handindex" | "index" => Name::Finger(2),
-        "handmiddle" | "middle" => Name::Finger(3),
-        "handring" | "ring" => Name::Finger(4),
-        "handpinky" | "pinky" => Name::Finger(5),
-        "finger" => Name::Finger(base.strip_prefix("finger")?.bytes().next()?.checked_sub(b'0')?),
-        "upleg" | "upperleg" | "thigh" => Name::Thigh,
-        "leg" | "lowerleg" | "calf" => Name::Calf,
-        "foot" => Name::Foot,
-        "toebase" | "toe" | "ball" => Name::Toe,
-        _ => return None,
-    };
-    Some((name, side)).filter(|(name, _)| !matches!(name, Name::Finger(0 | 1 | 6..)))
-}
-
-/// Row of the first joint of this name.
-fn find(bones: &[import::Bone], name: Name, side: usize) -> Option<usize> {
-    let is_it = |bone: &import::Bone| known(&bone.name) == Some((name, side));
-    bones.iter().position(is_it)
-}
-
-/// As [`find`].
-///
-/// # Errors
-/// A sentence that names the missing joint.
-fn need(bones: &[import::Bone], name: Name, side: usize) -> Result<usize, String> {
-    let word = match name {
-        Name::Hips => "Hips".to_owned(),
-        Name::Spine => "Spine".to_owned(),
-        Name::Head => "Head".to_owned(),
-        _ => {
-            let side = if side == 0 { "Left" } else { "Right" };
-            let word = match name {
-                Name::UpperArm => "Arm",
-                Name::Forearm => "ForeArm",
-                Name::Hand => "Hand",
-                Name::Thigh => "UpLeg",
-                Name::Calf => "Leg",
-                _ => "Foot",
-            };
-            format!("{side}{word}")
-        }
-    };
-    find(bones, name, side)
-        .ok_or_else(|| format!("has no joint `{word}`: expected the joint names of Mixamo or MakeHuman"))
-}
-
 /// Degrees around y by which the character's front is turned from +z.
 ///
 /// # Errors
 /// A missing joint.
 pub fn facing(bones: &[import::Bone]) -> Result<f32, String> {
+    let names: Vec<Option<(Name, usize)>> = bones.iter().map(|bone| known(&bone.name)).collect();
     let [left, right] =
-        [need(bones, Name::Thigh, 0)?, need(bones, Name::Thigh, 1)?].map(|row| bones[row].place);
+        [need(&names, Name::Thigh, 0)?, need(&names, Name::Thigh, 1)?].map(|row| bones[row].place);
     let front = (left - right).cross(Vec3::Y);
     Ok(libm::atan2f(front.x, front.z).to_degrees())
 }
 
 /// A character's bones.
 pub struct Skeleton {
-    /// Bones below the hips.
+    /// The hips and all bones below them.
     pub bones: Vec<Bone>,
     pub rest: Rest,
-    /// By bone: its part of the body, and its direction at rest.
+    /// By bone: part of the body, and direction at rest.
     pub regions: Vec<Region>,
     pub axes: Vec<Vec3>,
-    /// Row in `bones` of each node of the file.
+    /// Index in `bones` of each node of the file.
     pub rows: Vec<Option<usize>>,
 }
 
@@ -145,29 +51,30 @@ impl Skeleton {
     /// # Errors
     /// A sentence that names a missing joint.
     pub fn new(nodes: &[import::Bone]) -> Result<Self, String> {
-        let hips = need(nodes, Name::Hips, 0)?;
-        need(nodes, Name::Spine, 0)?;
-        need(nodes, Name::Head, 0)?;
+        let names: Vec<Option<(Name, usize)>> = nodes.iter().map(|node| known(&node.name)).collect();
+        let hips = need(&names, Name::Hips, 0)?;
+        need(&names, Name::Spine, 0)?;
+        need(&names, Name::Head, 0)?;
         let place = |row: usize| nodes[row].place;
         let [mut upper_arms, mut forearms, mut thighs, mut calves, mut feet] = [[Mat3::IDENTITY; 2]; 5];
         let mut palms = [Vec3::ZERO; 2];
         let mut lift = 0.0_f32;
         for side in [0, 1] {
-            let joint = |name| need(nodes, name, side).map(place);
+            let joint = |name| need(&names, name, side).map(place);
             let [shoulder, elbow, wrist] =
                 [joint(Name::UpperArm)?, joint(Name::Forearm)?, joint(Name::Hand)?];
             let [hip, knee, ankle] = [joint(Name::Thigh)?, joint(Name::Calf)?, joint(Name::Foot)?];
             let down = (elbow - shoulder).normalize_or(Vec3::NEG_Y);
-            // An arm that was raised from its side without a twist.
+            // Assumes that the arm was raised from its side without a twist.
             let hinge = Quat::from_rotation_arc(Vec3::NEG_Y, down) * Vec3::X;
             upper_arms[side] = hanging(down, hinge);
             forearms[side] = hanging(wrist - elbow, hinge);
             thighs[side] = hanging(knee - hip, Vec3::X);
             calves[side] = hanging(ankle - knee, Vec3::X);
-            let toes = find(nodes, Name::Toe, side).map_or(Vec3::Z, |row| place(row) - ankle);
+            let toes = find(&names, Name::Toe, side).map_or(Vec3::Z, |row| place(row) - ankle);
             feet[side] = rotate_y(libm::atan2f(toes.x, toes.z).to_degrees());
             lift += 0.5 * (libm::acosf((-down.y).clamp(-1.0, 1.0)).to_degrees() - 35.0).max(0.0);
-            let fingers = [2, 5].map(|finger| find(nodes, Name::Finger(finger), side));
+            let fingers = [2, 5].map(|finger| find(&names, Name::Finger(finger), side));
             if let [Some(index), Some(small)] = fingers {
                 // Fingers bend towards the palm around this axis.
                 let across = (place(small) - place(index)).normalize_or_zero();
@@ -181,9 +88,8 @@ impl Skeleton {
             axes: Vec::new(),
             rows: vec![None; nodes.len()],
         };
-        let names: Vec<Option<(Name, usize)>> = nodes.iter().map(|node| known(&node.name)).collect();
         let count = |known: (Name, usize)| names.iter().filter(|name| **name == Some(known)).count();
-        // Joints of a limb's or the spine's name that are still to come.
+        // By chain: the number of joints that are still to come.
         let chains = [(Name::UpperArm, 0), (Name::UpperArm, 1), (Name::Thigh, 0), (Name::Thigh, 1)];
         let mut left: HashMap<(Name, usize), usize> =
             chains.into_iter().map(|name| (name, count(name))).collect();
@@ -201,7 +107,7 @@ impl Skeleton {
                 continue;
             }
             let above = parent.map_or(Region::Trunk, |row| skeleton.regions[row]);
-            // The last joint of a limb's name takes the limb's whole turn, those before it a half of the rest each.
+            // The last joint of a chain has the limb's rotation. A joint before n others goes 1/2ⁿ of the way to it.
             let mut after = |name: Name, side: usize| {
                 let left = left.entry((name, side)).or_default();
                 *left = left.saturating_sub(1);

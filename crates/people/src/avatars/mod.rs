@@ -1,5 +1,5 @@
-//! People from rigged characters: GLB files with one skeleton that has the joint names of Mixamo or MakeHuman. Each gets a
-//! random pose, slightly other proportions, and other colours of cloth and hair.
+//! People from rigged characters: GLB files of one skeleton with the joint names of Mixamo or MakeHuman. Each person
+//! gets a random pose, slightly other proportions, and other colours of cloth and hair.
 
 mod colors;
 mod joints;
@@ -15,15 +15,15 @@ use snapsnap_base::random::stream;
 use snapsnap_mesh::import::{self, Rigged};
 use snapsnap_mesh::mesh::Mesh;
 
+use crate::figure::{Build, Figure, Pose};
 use crate::files::with_ending;
 use crate::math::rotate_y;
 use crate::poses::Poses;
 use crate::skeleton::{self, Owner};
-use crate::synth::figure::{Build, Figure, Pose};
 use crate::synth::stand;
 use joints::{Region, Skeleton};
 
-/// Heights of characters in metres. Others are in another unit.
+/// Accepted heights of characters in metres. Other heights mean another unit.
 const HEIGHTS: std::ops::RangeInclusive<f32> = 0.5..=3.0;
 /// Most positions and triangles of a character.
 const LARGEST: usize = 1_000_000;
@@ -34,7 +34,7 @@ const GAP: f32 = 0.012;
 pub struct Character {
     /// Its mesh.
     pub mesh: Mesh,
-    /// Whether its file has morph targets or animations, which are ignored.
+    /// Whether the file has morph targets or animations, which are ignored.
     pub has_animations: bool,
 }
 
@@ -44,8 +44,8 @@ pub struct Avatars {
 }
 
 impl Avatars {
-    /// The GLB files directly in `folder` that belong to chosen people. `is_chosen` receives the index of a person. Files
-    /// whose names are equal up to the last `_` show one person.
+    /// The GLB files directly in `folder` that belong to chosen people. `is_chosen` receives the index of a person.
+    /// Files whose names are equal up to the last `_` show one person.
     ///
     /// # Errors
     /// [`FileError`] if the folder cannot be read, or has no such file.
@@ -65,8 +65,8 @@ impl Avatars {
         Ok(Self { files })
     }
 
-    /// The person of this name: one of the characters, life-size in metres, standing on y = 0 and facing +z. Often in one of
-    /// `poses`.
+    /// The person of this name: one of the characters, life-size in metres, standing on y = 0 and facing +z. Often in
+    /// one of `poses`.
     ///
     /// # Errors
     /// [`FileError`] naming a file that is damaged or no character, and why.
@@ -153,7 +153,7 @@ fn character(path: &Path, poses: Option<&Poses>, random: &mut ChaCha8Rng) -> Res
 }
 
 impl Skeleton {
-    /// Other lengths and girths of trunk, arms and legs, and sizes of head, hands and feet.
+    /// Randomly scales lengths and girths of trunk, arms and legs, and sizes of head, hands and feet.
     fn vary(&mut self, random: &mut ChaCha8Rng) {
         let mut between = |range: f32| 1.0 + range * random.random_range(-1.0..1.0_f32);
         let girth = between(0.06);

@@ -8,31 +8,25 @@ use std::sync::{Arc, Mutex, PoisonError};
 use glam::Vec3;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
-use snapsnap_base::{FileError, file, quoted};
+use snapsnap_base::{FileError, quoted};
 
 use super::proxy::Wardrobe;
+use super::text::{read_text, vector, wrong};
 use crate::poses::Poses;
 
-/// Metres per unit of MakeHuman's files, a decimetre.
-pub const METRES: f32 = 0.1;
-/// Size limit of a file. The largest of MakeHuman's files has a few megabytes.
-const MAX_BYTES: u64 = 256 << 20;
-
-/// Largest coordinate, decimetres.
-const LARGEST: f32 = 1000.0;
 /// Required groups of the base mesh and bones of the rig.
 const GROUPS: [&str; 5] = ["body", "helper-tights", "helper-skirt", "helper-l-eye", "helper-r-eye"];
 const BONES: [&str; 5] = ["spine03", "neck01", "head", "jaw", "oris01"];
 const SIDED_BONES: [&str; 9] =
     ["eye", "upperarm01", "lowerarm01", "wrist", "finger3-3", "upperleg01", "lowerleg01", "foot", "clavicle"];
 
-/// Row and displacement in metres of each vertex that moves.
+/// Morph target: index and displacement in metres of each vertex that moves.
 pub type Target = Arc<Vec<(u32, Vec3)>>;
 
 /// Faces of each group of the base mesh. Triangles repeat their last corner.
 type Groups = HashMap<String, Vec<[u32; 4]>>;
 
-/// A bone: its name, its parent's row, and the vertices whose means are its head and its tail.
+/// A bone: its name, its parent's index, and the vertices whose means are its head and its tail.
 #[derive(Debug, Clone)]
 pub struct RigBone {
     pub name: String,
@@ -88,12 +82,13 @@ impl Library {
             return Err(FileError::unsuitable(&path, format!("has no bone `{bone}`")));
         }
         let wardrobe = Wardrobe::open(&root, positions.len())?;
-        let poses = Poses::within(&root.join("poses"))?;
+        let folder = root.join("poses");
+        let poses = if folder.is_dir() { Poses::open(&folder)? } else { None };
         let targets = Mutex::default();
         Ok(Self { root, positions, groups, bones, weights, targets, poses, wardrobe })
     }
 
-    /// The morph target at the path `name` below `targets`, without its ending. Each file is read once.
+    /// The morph target `name`: a path below `targets` without extension. Each file is read once.
     ///
     /// # Errors
     /// [`FileError`] if it is missing or damaged.
@@ -118,7 +113,7 @@ impl Library {
     }
 }
 
-/// The value of a file that was read before, or what `read` returns.
+/// The cached value of a file, or else the result of `read`.
 fn once<T>(
     cache: &Mutex<HashMap<PathBuf, Arc<T>>>,
     path: &Path,
@@ -133,26 +128,12 @@ fn once<T>(
     Ok(value)
 }
 
-pub fn read_text(path: &Path) -> Result<String, FileError> {
-    file::read_text(path, MAX_BYTES).map_err(FileError::read(path))
-}
-
 fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T, FileError> {
     serde_json::from_str(&read_text(path)?).map_err(|e| FileError::unsuitable(path, e))
 }
 
-pub fn wrong(path: &Path, line: usize, text: &str) -> FileError {
-    FileError::unsuitable(path, format!("line {}, `{}`: not understood", line + 1, quoted(text)))
-}
-
-/// Three numbers within ±`LARGEST`, converted to metres.
-pub fn vector<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
-    let mut next = || words.next()?.parse().ok().filter(|v: &f32| v.abs() < LARGEST);
-    Some(METRES * Vec3::new(next()?, next()?, next()?))
-}
-
-/// Reads positions and groups. The importer of `snapsnap_mesh` changes the rows of vertices, which targets and weights
-/// refer to.
+/// Reads positions and groups. The importer of `snapsnap_mesh` would renumber vertices, to which targets and weights
+/// refer.
 fn read_base(path: &Path) -> Result<(Vec<Vec3>, Groups), FileError> {
     let text = read_text(path)?;
     let mut positions = Vec::new();

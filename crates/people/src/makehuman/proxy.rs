@@ -1,6 +1,5 @@
 //! Clothes, hair, hats and shoes of MakeHuman's asset collection: meshes bound to the base mesh (`.mhclo` and `.obj`).
 
-use std::collections::HashMap;
 use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
@@ -8,10 +7,22 @@ use std::sync::Arc;
 use glam::{Vec2, Vec3};
 use rand::Rng;
 use snapsnap_base::FileError;
+use snapsnap_mesh::mesh::pieces;
 
-use super::files::{METRES, read_text, vector, wrong};
-use super::net::{Net, Vertex};
+use super::patch::{Patch, Vertex};
+use super::text::{METRES, read_text, vector, wrong};
 use crate::files::{entries, with_ending};
+use crate::pattern::Pattern;
+use crate::synth::outfit::{Cut, Outfit};
+
+/// Share of people in a suit of the collection, among people without a skirt or a coat.
+const SUITS: f32 = 0.7;
+/// Share of people in shoes of the collection, among people without a suit of the collection.
+const SHOES: f32 = 0.4;
+/// Share of people with hair of the collection, among people who are not bald and have no cap.
+const HAIR: f32 = 0.65;
+/// Share of people with a hat of the collection.
+const HATS: f32 = 0.06;
 
 /// Purpose of a proxy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -26,7 +37,7 @@ pub enum Kind {
 /// Largest scale of offsets. Larger bodies come from damaged files.
 const MAX_SCALE: f32 = 10.0;
 
-/// A vertex: a mixture of vertices of the base mesh, and an offset in metres before it is scaled.
+/// Binding of a vertex: a weighted sum of base mesh vertices, and an offset in metres before scaling.
 #[derive(Debug, Clone, Copy)]
 struct Binding {
     rows: [u32; 3],
@@ -34,7 +45,7 @@ struct Binding {
     offset: Vec3,
 }
 
-/// Two vertices of the base mesh, and their distance along an axis for which offsets are made, metres.
+/// Two vertices of the base mesh, and the distance along an axis, metres, for which the offsets were made.
 type Scale = ([u32; 2], f32);
 
 /// A face: its vertices, and their texture coordinates.
@@ -43,27 +54,27 @@ type Corners = (Vec<u32>, Vec<Vec2>);
 /// A proxy.
 #[derive(Debug, Clone)]
 pub struct Proxy {
-    /// Clothes have it by their tags.
+    /// Clothes have their kind in their tags.
     kind: Kind,
     bindings: Vec<Binding>,
     /// For x, y and z.
     scales: [Option<Scale>; 3],
-    /// Whether a vertex of the base mesh lies below it and is left out.
+    /// By vertex of the base mesh: whether the proxy covers it, so that it is left out.
     pub hides: Vec<bool>,
-    /// Corners of three or four, and their texture coordinates.
+    /// Faces of three or four corners.
     faces: Vec<Corners>,
 }
 
-/// A proxy on a body, in pieces that hang together.
+/// A proxy on a body, in connected pieces.
 pub struct Fitted {
-    pub net: Net,
+    pub patch: Patch,
     /// Texture coordinates of the faces' corners.
     pub texcoords: Vec<Vec<Vec2>>,
-    /// By face: its piece. The largest piece is 0.
+    /// By face: index of its piece. The largest piece is 0.
     pub pieces: Vec<usize>,
 }
 
-/// The proxies of a folder, by kind.
+/// The proxies of MakeHuman's folders.
 #[derive(Debug, Default)]
 pub struct Wardrobe {
     proxies: Vec<Stored>,
@@ -78,8 +89,8 @@ struct Stored {
 }
 
 impl Wardrobe {
-    /// The proxies, of a base mesh of so many vertices, in the folders `clothes` and `hair` of MakeHuman's `data`. Without
-    /// these, it is empty. All of them are read, so that a damaged file is found whether or not somebody wears it.
+    /// Reads the proxies in the folders `clothes` and `hair` of MakeHuman's `data`, for a base mesh of `vertices`
+    /// vertices. Missing folders are empty. Unused proxies are read, too, so that damaged files are always found.
     ///
     /// # Errors
     /// [`FileError`] for a file that is damaged or cannot be read.
@@ -102,13 +113,51 @@ impl Wardrobe {
         Ok(Self { proxies })
     }
 
-    /// One of this kind for this sex, 0 female and 1 male.
+    /// A random proxy of this kind for this sex, 0 female and 1 male.
     pub fn choose(&self, kind: Kind, sex: f32, random: &mut impl Rng) -> Option<Arc<Proxy>> {
         let other = if sex < 0.5 { "male_" } else { "female_" };
         let fits = |stored: &&Stored| stored.proxy.kind == kind && !stored.name.starts_with(other);
         let fitting: Vec<&Stored> = self.proxies.iter().filter(fits).collect();
         let draw: f32 = random.random_range(0.0..1.0);
         fitting.get((draw * fitting.len() as f32) as usize).map(|stored| stored.proxy.clone())
+    }
+}
+
+/// The proxies that a person wears.
+pub struct Worn {
+    pub suit: Option<Arc<Proxy>>,
+    pub shoes: Option<Arc<Proxy>>,
+    pub hair: Option<Arc<Proxy>>,
+    pub hat: Option<Arc<Proxy>>,
+    /// Cloth of hats, and of garments between top and bottom.
+    pub other: Pattern,
+}
+
+impl Worn {
+    pub fn draw(
+        wardrobe: &Wardrobe,
+        outfit: &Outfit,
+        sex: f32,
+        is_draped: bool,
+        random: &mut impl Rng,
+    ) -> Self {
+        let [suit, shoes, hair, hat] = [(); 4].map(|()| random.random_range(0.0..1.0_f32));
+        let mut choose =
+            |kind: Kind, is_wanted: bool| wardrobe.choose(kind, sex, random).filter(|_| is_wanted);
+        let own_shoes = choose(Kind::Shoes, true);
+        let suit = choose(Kind::Suit, !is_draped && suit < SUITS && own_shoes.is_some());
+        let has_shoes = suit.is_some() || shoes < SHOES;
+        let has_hair = !matches!(outfit.cut, Cut::Bald | Cut::Cap);
+        let hair = choose(Kind::Hair, has_hair && hair < HAIR);
+        let hat = choose(Kind::Hat, has_hair && hat < HATS);
+        let other = Pattern::draw_quiet(random);
+        Self { suit, shoes: own_shoes.filter(|_| has_shoes), hair, hat, other }
+    }
+
+    /// Whether a vertex of the base mesh lies below clothes.
+    pub fn hides(&self, row: u32) -> bool {
+        let worn = [&self.suit, &self.shoes];
+        worn.into_iter().flatten().any(|proxy| proxy.hides.get(row as usize) == Some(&true))
     }
 }
 
@@ -119,7 +168,7 @@ fn numbers<'a, T: FromStr, const N: usize>(words: &mut impl Iterator<Item = &'a 
 }
 
 impl Proxy {
-    /// Reads a proxy of a base mesh of so many vertices.
+    /// Reads a proxy for a base mesh of `vertices` vertices.
     ///
     /// # Errors
     /// [`FileError`] naming the file and the line.
@@ -176,7 +225,7 @@ impl Proxy {
         Ok(proxy)
     }
 
-    /// The proxy on a body. `bones` moves a resting point as the weights of the base mesh's vertices say.
+    /// Fits the proxy to a body. `bones` moves a resting point by the skin weights of a mixture of base mesh vertices.
     pub fn fit(&self, body: &[Vertex], bones: impl Fn(&[(u32, f32)], Vec3) -> Vec3) -> Fitted {
         let scale = |axis: usize| {
             self.scales[axis].map_or(1.0, |([a, b], length)| {
@@ -189,7 +238,7 @@ impl Proxy {
             let shares: Vec<(u32, f32)> = binding.rows.into_iter().zip(binding.shares).collect();
             let at = |(row, share): &(u32, f32)| *share * body[*row as usize].rest;
             let rest = shares.iter().map(at).sum::<Vec3>() + binding.offset * scale;
-            // Shares below 0 lie beyond the triangle; bones follow its corners.
+            // Negative shares lie beyond the triangle; bones follow the triangle's corners.
             let kept: Vec<(u32, f32)> = shares.iter().map(|(row, share)| (*row, share.max(0.0))).collect();
             let sum: f32 = kept.iter().map(|(_, share)| share).sum();
             let kept: Vec<(u32, f32)> = if sum > 0.0 {
@@ -203,19 +252,19 @@ impl Proxy {
             Vertex { rest, posed: bones(&kept, rest), parts }
         };
         let vertices: Vec<Vertex> = self.bindings.iter().map(vertex).collect();
-        let net = Net { vertices, faces: self.faces.iter().map(|(rows, _)| rows.clone()).collect() };
-        let pieces = pieces(&net);
+        let patch = Patch { vertices, faces: self.faces.iter().map(|(rows, _)| rows.clone()).collect() };
+        let pieces = pieces(patch.vertices.len(), patch.faces.iter().map(|face| &face[..]));
         let texcoords = self.faces.iter().map(|(_, texcoords)| texcoords.clone()).collect();
-        Fitted { net, texcoords, pieces }
+        Fitted { patch, texcoords, pieces }
     }
 }
 
 impl Fitted {
-    /// One step of [`Net::subdivide`].
+    /// One step of [`Patch::subdivide`].
     pub fn subdivide(&self) -> Self {
-        let net = self.net.subdivide();
-        let mut texcoords = Vec::with_capacity(net.faces.len());
-        let mut pieces = Vec::with_capacity(net.faces.len());
+        let patch = self.patch.subdivide();
+        let mut texcoords = Vec::with_capacity(patch.faces.len());
+        let mut pieces = Vec::with_capacity(patch.faces.len());
         for (corners, piece) in self.texcoords.iter().zip(&self.pieces) {
             let count = corners.len();
             let middle = corners.iter().sum::<Vec2>() / count as f32;
@@ -225,7 +274,7 @@ impl Fitted {
                 pieces.push(*piece);
             }
         }
-        Self { net, texcoords, pieces }
+        Self { patch, texcoords, pieces }
     }
 }
 
@@ -262,7 +311,7 @@ fn hide(line: &str, hides: &mut [bool]) -> Option<()> {
     Some(())
 }
 
-/// Faces of an OBJ of so many vertices, with texture coordinates, 0 without.
+/// Faces of an OBJ of `vertices` vertices. Missing texture coordinates are 0.
 fn read_faces(path: &Path, vertices: usize) -> Result<Vec<Corners>, FileError> {
     let text = read_text(path)?;
     let (mut count, mut texcoords, mut faces) = (0, Vec::new(), Vec::new());
@@ -297,31 +346,4 @@ fn read_faces(path: &Path, vertices: usize) -> Result<Vec<Corners>, FileError> {
         return Err(FileError::unsuitable(path, message));
     }
     Ok(faces)
-}
-
-/// The pieces that hang together, largest first, by face.
-fn pieces(net: &Net) -> Vec<usize> {
-    let mut roots: Vec<usize> = (0..net.vertices.len()).collect();
-    fn root(roots: &mut [usize], mut row: usize) -> usize {
-        while roots[row] != row {
-            roots[row] = roots[roots[row]];
-            row = roots[row];
-        }
-        row
-    }
-    for face in &net.faces {
-        let first = root(&mut roots, face[0] as usize);
-        for corner in &face[1..] {
-            let other = root(&mut roots, *corner as usize);
-            roots[other] = first;
-        }
-    }
-    let owners: Vec<usize> = net.faces.iter().map(|face| root(&mut roots, face[0] as usize)).collect();
-    let mut sizes: HashMap<usize, usize> = HashMap::new();
-    owners.iter().for_each(|owner| *sizes.entry(*owner).or_default() += 1);
-    let mut order: Vec<usize> = sizes.keys().copied().collect();
-    order.sort_unstable_by_key(|owner| (std::cmp::Reverse(sizes[owner]), *owner));
-    let places: HashMap<usize, usize> =
-        order.into_iter().enumerate().map(|(place, owner)| (owner, place)).collect();
-    owners.iter().map(|owner| places[owner]).collect()
 }

@@ -1,13 +1,12 @@
 //! Bones of a morphed body, and the body in another pose (linear blend skinning).
 
 use glam::{Mat3, Vec3};
+use snapsnap_mesh::mesh::bounds;
 
-use super::ORDER;
 use super::files::Library;
-use super::net::Net;
-use crate::math::bounds;
+use super::patch::{ORDER, Patch};
+use crate::figure::{Bone, Build, Figure, Pose};
 use crate::skeleton::{self, Joint, Owner, Placed, Rest, hanging};
-use crate::synth::figure::{Bone, Build, Figure, Pose};
 use crate::synth::part::Kind;
 
 /// Joints of a morphed body in the pose of the base mesh.
@@ -27,7 +26,7 @@ impl<'a> Joints<'a> {
         Self { library, heads, tails }
     }
 
-    /// Row of a bone.
+    /// Index of a bone.
     pub fn row(&self, name: &str) -> Option<usize> {
         self.library.bones.iter().position(|bone| bone.name == name)
     }
@@ -48,8 +47,8 @@ impl<'a> Joints<'a> {
         bounds(lips.map(|(_, head)| *head))
     }
 
-    /// The figure of the body. `crown` is the height of the top of the head. `middle` returns z halfway between belly and
-    /// back at a height, since the spine lies close to the back.
+    /// The figure of the body. `crown` is the height of the top of the head. `middle` returns z halfway between belly
+    /// and back at a height, since the spine lies close to the back.
     pub fn figure(&self, build: Build, crown: f32, middle: impl Fn(f32) -> f32) -> Figure {
         let sides = [0, 1];
         let hips = sides.map(|side| self.head(&sided("upperleg01", side)));
@@ -92,7 +91,7 @@ impl<'a> Joints<'a> {
         }
     }
 
-    /// `positions` in `pose`, and the places of the bones. `rest` is the figure of the resting body.
+    /// `positions` in `pose`, and the transforms of the bones. `rest` is the figure of the resting body.
     pub fn pose(&self, positions: &[Vec3], rest: &Figure, pose: &Pose) -> (Vec<Vec3>, Vec<Placed>) {
         let bones = self.library.bones.iter().enumerate().map(|(row, bone)| skeleton::Bone {
             joint: self.joint(&bone.name),
@@ -110,7 +109,7 @@ impl<'a> Joints<'a> {
         ((0..positions.len()).map(moved).collect(), placed)
     }
 
-    /// What a bone of the default rig follows.
+    /// The part of a pose that a bone of the default rig follows.
     fn joint(&self, bone: &str) -> Joint {
         let (name, side) = match bone.rsplit_once('.') {
             Some((name, "L")) => (name, 0),
@@ -157,8 +156,8 @@ fn sided(name: &str, side: usize) -> String {
     format!("{name}.{}", if side == 0 { 'L' } else { 'R' })
 }
 
-/// Whether the left and the right hand of `body` lie in trunk or legs, or nearer to them than `gap` metres.
-pub fn sunk_hands(body: &Net, gap: f32) -> [bool; 2] {
+/// Whether the left and the right hand of `body` lie inside trunk or legs, or less than `gap` metres outside.
+pub fn sunk_hands(body: &Patch, gap: f32) -> [bool; 2] {
     let owners = body.vertices.iter().map(|vertex| match ORDER[vertex.part()] {
         (Kind::Trunk | Kind::Leg, _) => Owner::Solid,
         (Kind::Hand, side) => Owner::Hand(side),

@@ -2,6 +2,7 @@ use std::collections::HashSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use super::patch::{PARTS, Patch, Vertex};
 use super::*;
 
 /// MakeHuman's data beside the checkout. Without them, a message is printed.
@@ -38,8 +39,8 @@ fn people_stand_upright_and_follow_their_names() {
     let (one, again) = (mesh("test/1"), mesh("test/1"));
     assert_eq!(one.positions, again.positions);
     assert_eq!(one.faces, again.faces);
-    // Recorded numbers, the same on every machine. Only the mean has a tolerance: where two vertices of cloth are equally
-    // near, machines may press skin against either.
+    // Recorded numbers, the same on every machine. Only the mean has a tolerance: where two vertices of cloth are
+    // equally near, machines may press skin against either.
     let texture = one.materials[0].texture.as_ref().expect("has a texture");
     let light: u64 = texture.as_raw().iter().map(|b| u64::from(*b)).sum();
     assert_eq!((one.positions.len(), one.faces.len(), light), (104_789, 203_260, 312_716_998));
@@ -48,9 +49,9 @@ fn people_stand_upright_and_follow_their_names() {
     assert!((mean - expected).length() < 1e-5, "{mean}");
 }
 
-/// Counts vertices of `inner` that lie outside of the cloth over them by more than 1 mm, and all that have cloth over them.
-/// That cloth is the nearest in the pose of all within 2 cm in the resting pose.
-fn through(inner: &Net, cloth: &Net, inside: impl Fn(&Vertex) -> f32) -> (usize, usize) {
+/// Counts the vertices of `inner` that lie more than 1 mm outside of the cloth over them, and all vertices with cloth
+/// over them. The cloth over a vertex is the nearest in the pose within 2 cm in the resting pose.
+fn through(inner: &Patch, cloth: &Patch, inside: impl Fn(&Vertex) -> f32) -> (usize, usize) {
     let normals = cloth.normals();
     let (mut under, mut through) = (0, 0);
     for vertex in inner.vertices.iter().filter(|v| inside(v) > 0.01) {
@@ -77,11 +78,11 @@ fn nothing_comes_through_cloth() {
         let whole = person.group("body").subdivide();
         let [bottom, top] = person.layers();
         let garments = [bottom, top, person.shoes()];
-        let skin = person.pressed_skin(person.skin(), &garments).net;
+        let skin = person.pressed_skin(person.skin(), &garments).patch;
         assert_eq!(skin.faces.len(), whole.faces.len());
-        let [bottom, top, shoes] = garments.map(|piece| piece.net);
+        let [bottom, top, shoes] = garments.map(|piece| piece.patch);
         type Inside<'a> = &'a dyn Fn(&Vertex) -> f32;
-        let layers: [(&Net, &Net, Inside, usize); 4] = [
+        let layers: [(&Patch, &Patch, Inside, usize); 4] = [
             (&skin, &top, &|v| person.in_top(v), 0),
             (&skin, &bottom, &|v| person.in_bottom(v), 0),
             (&skin, &shoes, &|v| person.in_shoes(v), 0),
@@ -107,7 +108,7 @@ fn suits_cover_what_is_below_them() {
     for person in people.filter(|person| person.worn.suit.is_some()).take(12) {
         let suit = person.worn.suit.as_ref().expect("is worn");
         suits.insert(std::sync::Arc::as_ptr(suit));
-        let (skin, whole) = (person.skin().net, person.group("body").subdivide());
+        let (skin, whole) = (person.skin().patch, person.group("body").subdivide());
         // Arms, waist or calves may be bare.
         assert!(
             4 * skin.faces.len() < 3 * whole.faces.len(),
@@ -115,7 +116,7 @@ fn suits_cover_what_is_below_them() {
             skin.faces.len(),
             whole.faces.len()
         );
-        let suit = person.fit(suit).subdivide().net;
+        let suit = person.fit(suit).subdivide().patch;
         let hidden = |v: &Vertex| if v.parts[0] + v.parts[2] + v.parts[3] > 0.9 { 1.0 } else { 0.0 };
         let (through, under) = through(&skin, &suit, hidden);
         (out, all) = (out + through, all + under);
@@ -147,8 +148,8 @@ fn damaged_proxies_are_named() {
     let at = |p: Vec3| Vertex { rest: p, posed: p, parts: [0.0; PARTS] };
     let body = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z, Vec3::ONE].map(at);
     let fitted = proxy.fit(&body, |_, p| p + Vec3::Y);
-    // Offsets of decimetres, not scaled along z; the scale along x is 1 m of 0.1 m.
-    let first = fitted.net.vertices[0];
+    // Offsets are in decimetres and not scaled along z. The scale along x is 1 m of 0.1 m.
+    let first = fitted.patch.vertices[0];
     assert!((first.rest - Vec3::new(0.25, 0.25, 0.01)).length() < 1e-6, "{}", first.rest);
     assert_eq!(first.posed, first.rest + Vec3::Y);
     assert_eq!(fitted.subdivide().texcoords[0][2], glam::Vec2::splat(1.0 / 3.0));

@@ -3,11 +3,12 @@
 use std::f32::consts::PI;
 
 use glam::{Mat3, Vec2, Vec3, Vec3Swizzles};
+use snapsnap_mesh::mesh::bounds;
 
-use super::figure::{Bone, Figure, sign};
 use super::outfit::{Cut, Lower, Outfit};
 use super::part::{Drape, Kind, Layer, Marks, Part, Shape};
-use crate::math::{bounds, sin_cos};
+use crate::figure::{Bone, Figure, sign};
+use crate::math::sin_cos;
 
 pub fn trunk(figure: &Figure, outfit: &Outfit) -> Part {
     let Figure { build, pelvis, chest, neck, .. } = figure;

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::body::Body;
 use super::paint::Painter;
 use super::surface::Surface;
-use snapsnap_mesh::mesh::{Face, Material, Mesh};
+use snapsnap_mesh::mesh::{Face, Material, Mesh, bytes};
 
 /// Metres per texel, finer than a pixel of the sharpest views.
 const TEXEL: f32 = 0.0016;
@@ -28,7 +28,7 @@ struct Chart {
     /// Left and top texel.
     origin: [usize; 2],
     size: [usize; 2],
-    /// Metres along the axis at the top row.
+    /// Metres along the axis at the top row of texels.
     first: f32,
     /// Radians and metres per texel.
     step: [f32; 2],
@@ -36,7 +36,7 @@ struct Chart {
 
 /// The faces of `surface` as a mesh with a texture; the caller adds the positions.
 pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
-    // Of each face: the part of most corners, and the places of the corners on its chart.
+    // For each face: the part of most corners, and the positions of the corners on the part's chart.
     let charted: Vec<(usize, [(f32, f32); 3])> = surface
         .faces
         .par_iter()
@@ -46,7 +46,7 @@ pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
             let mut places = face.map(|row| body.parts[owner].chart(surface.positions[row as usize]));
             let first = places[0].0;
             for place in &mut places[1..] {
-                // The short way round.
+                // Unwraps the angle to less than half a turn from the first corner.
                 place.0 -= 2.0 * PI * ((place.0 - first) / (2.0 * PI)).round();
             }
             (owner, places)
@@ -72,14 +72,12 @@ pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
             for x in 0..chart.size[0] {
                 let angle = (x as f32 + 0.5) * chart.step[0] - PI - OVERLAP;
                 let angle = angle - 2.0 * PI * (angle / (2.0 * PI)).round();
-                let color = painter.color(part, angle, along);
-                row[chart.origin[0] + x] =
-                    color.clamp(Vec3::ZERO, Vec3::ONE).to_array().map(|c| (c * 255.0).round() as u8);
+                row[chart.origin[0] + x] = bytes(painter.color(part, angle, along));
             }
         }
     });
-    let bytes = picture.into_flattened();
-    let texture = RgbImage::from_raw(size[0] as u32, size[1] as u32, bytes).expect("three bytes per texel");
+    let picture = picture.into_flattened();
+    let texture = RgbImage::from_raw(size[0] as u32, size[1] as u32, picture).expect("three bytes per texel");
 
     let mut mesh = Mesh {
         materials: vec![Material { color: Vec3::ONE, texture: Some(Arc::new(texture)) }],
@@ -105,7 +103,7 @@ pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
     mesh
 }
 
-/// Arranges charts in shelves, the highest first. Also returns width and height of the picture.
+/// Shelf packing of charts, the highest first. Also returns width and height of the picture.
 fn pack(body: &Body, spans: &[(f32, f32)]) -> (Vec<Chart>, [usize; 2]) {
     let mut charts: Vec<Chart> = body
         .parts

@@ -1,17 +1,18 @@
 //! Signed distances of a body with its clothes, the union of its parts.
 
 use glam::Vec3;
+use snapsnap_mesh::mesh::bounds;
 
 use super::anatomy;
-use super::figure::Figure;
 use super::outfit::Outfit;
 use super::part::{Kind, Layer, Part};
-use crate::math::{bounds, smooth_min, smoothstep};
+use crate::figure::Figure;
+use crate::math::{smooth_min, smoothstep};
 
 /// A dressed person.
 #[derive(Debug, Clone)]
 pub struct Body {
-    /// The trunk first.
+    /// The trunk is the first part.
     pub parts: Vec<Part>,
 }
 
@@ -21,8 +22,8 @@ const HEM_REACH: f32 = 0.04;
 const THICKEST: f32 = 0.08;
 
 impl Body {
-    /// Signed distance, and the row of the nearest part. If the distance exceeds `enough`, a number between the two may
-    /// take its place.
+    /// Signed distance, and the index of the nearest part. A distance that exceeds `enough` may be underestimated,
+    /// but never below `enough`.
     pub fn distance(&self, p: Vec3, enough: f32) -> (f32, usize) {
         let mut union = f32::INFINITY;
         let mut nearest = (f32::INFINITY, 0);
@@ -35,7 +36,7 @@ impl Body {
                 continue;
             }
             let skin = if part.drape.is_none() { part.skin(p) } else { f32::NEG_INFINITY };
-            // Cloth, whose thickness takes long to compute, cannot reach from there either.
+            // Nor does cloth reach the point. The exact thickness of cloth takes long to compute.
             let outside = skin - part.thickest();
             if outside > enough.max(0.0) + 0.06 {
                 union = union.min(outside);
@@ -63,8 +64,8 @@ impl Body {
         (union, nearest.1)
     }
 
-    /// Row of the part whose chart colours a place on the surface. It is the nearest part with two exceptions: hips that
-    /// fill a skirt have the skirt's cloth, and thighs above the top's hem have the trunk's.
+    /// Index of the part whose chart colours a point on the surface: the nearest part, with two exceptions. Hips that
+    /// fill a skirt have the skirt's cloth. Thighs above the top's hem have the trunk's cloth.
     pub fn owner(&self, p: Vec3, cell: f32) -> usize {
         let nearest = self.distance(p, 4.0 * cell).1;
         let kind = self.parts[nearest].kind;
@@ -88,7 +89,7 @@ impl Body {
         solid.map(|part| part.distance(p)).fold(f32::INFINITY, f32::min)
     }
 
-    /// A box around everything.
+    /// The bounding box of all parts.
     pub fn bounds(&self) -> (Vec3, Vec3) {
         let drapes = self.parts.iter().filter_map(|part| part.drape).flat_map(|drape| {
             let [top, bottom] = drape.ends;

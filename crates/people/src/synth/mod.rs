@@ -5,7 +5,6 @@
 mod anatomy;
 pub(crate) mod atlas;
 pub(crate) mod body;
-pub(crate) mod figure;
 pub(crate) mod outfit;
 pub(crate) mod paint;
 pub(crate) mod part;
@@ -13,10 +12,9 @@ pub(crate) mod surface;
 #[cfg(test)]
 mod tests;
 
-use body::Body;
-use figure::{Build, Figure, Pose};
-
+use crate::figure::{Build, Figure, Pose};
 use crate::poses::Poses;
+use body::Body;
 use outfit::Outfit;
 use paint::{FACE, Painter};
 use snapsnap_base::random::stream;

@@ -3,7 +3,7 @@
 use glam::Vec3;
 use rand::Rng;
 
-use super::figure::Build;
+use crate::figure::Build;
 use crate::pattern::{Pattern, Print, hue};
 
 /// Haircuts.

@@ -4,12 +4,12 @@ use std::f32::consts::{FRAC_PI_2, PI};
 
 use glam::{Vec2, Vec3};
 
-use super::figure::Figure;
 use super::outfit::{Cut, Lower, Outfit};
 use super::part::{Kind, Marks, Part};
+use crate::figure::Figure;
 use crate::math::{noise2, smoothstep};
 
-/// Places of the features of a face: angles around the head, and heights above the chin in heads.
+/// Positions of the features of a face: angles around the head, and heights above the chin as shares of the head.
 #[derive(Debug, Clone)]
 pub struct Face {
     pub eye: (f32, f32),
@@ -32,7 +32,7 @@ pub struct Painter<'a> {
     /// Centre of prints, metres along the trunk.
     chest: f32,
     face: &'a Face,
-    /// Whether trunk, arms and legs have the colour of skin, and whether feet have.
+    /// Whether trunk, arms and legs have the colour of skin, and whether feet have it.
     bare: [bool; 2],
 }
 
@@ -42,13 +42,13 @@ impl<'a> Painter<'a> {
         Self { outfit, marks: Marks::of(figure, outfit), chest, face, bare: [false; 2] }
     }
 
-    /// The same without colours of cloth on trunk, arms and legs, and on the feet.
+    /// Whether trunk, arms and legs, and whether feet, get the colour of skin instead of cloth.
     #[must_use]
     pub fn bare(self, bare: [bool; 2]) -> Self {
         Self { bare, ..self }
     }
 
-    /// Colour at a place of a part's chart: angle around the axis (0 in front, positive towards +x) and metres along it.
+    /// Colour at a point of a part's chart: angle around the axis (0 in front, positive towards +x), metres along it.
     pub fn color(&self, part: &Part, angle: f32, along: f32) -> Vec3 {
         let cloth = Vec2::new(angle * part.radius, along);
         let [body, feet] = self.bare;
@@ -170,7 +170,7 @@ impl<'a> Painter<'a> {
         self.outfit.shoes.color(cloth).lerp(self.outfit.shoes.main() * 0.6, toe)
     }
 
-    /// `up`: height above the chin in heads.
+    /// `up`: height above the chin, as a share of the head.
     fn head(&self, angle: f32, up: f32, cloth: Vec2) -> Vec3 {
         let Outfit { hair, lips, eyes, cut, .. } = self.outfit;
         let mut color = self.skin(cloth, 5);

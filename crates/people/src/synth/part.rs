@@ -7,11 +7,11 @@ use std::ops::Range;
 
 use glam::{Mat3, Vec2, Vec3, Vec3Swizzles};
 
-use super::figure::{Bone, Figure};
 use super::outfit::Outfit;
+use crate::figure::{Bone, Figure};
 use crate::math::{noise, sin_cos, smooth_min, smoothstep};
 
-/// A tapered capsule or an ellipsoid, in a frame of its own where it is round.
+/// A tapered capsule or an ellipsoid. In its own frame the shape is round.
 #[derive(Debug, Clone, Copy)]
 pub struct Shape {
     /// Start and end in the frame; equal for an ellipsoid.
@@ -28,7 +28,7 @@ pub struct Shape {
 }
 
 impl Shape {
-    /// A capsule from `a` to `b` with a radius at each end. `flat` contains factors of the radii along right, up, front.
+    /// A capsule from `a` to `b` with a radius at each end. `flat`: factors of the radii along right, up, front.
     pub fn capsule(a: Vec3, b: Vec3, radii: [f32; 2], frame: Mat3, flat: Vec3) -> Self {
         let turn = frame.transpose();
         let reach = (b - a).length() / 2.0 + radii[0].max(radii[1]) * flat.max_element();
@@ -83,10 +83,10 @@ pub struct Layer {
     pub from: f32,
     to: f32,
     thickness: f32,
-    /// More thickness towards `to`.
+    /// Additional thickness at `to`.
     flare: f32,
     folds: f32,
-    /// Largest [`neckline`] by which it ends earlier, in front and behind.
+    /// Largest [`neckline`] by which the layer ends earlier, in front and behind.
     pub drop: [f32; 2],
 }
 
@@ -107,12 +107,12 @@ pub fn neckline([front, behind]: [f32; 2], angle: f32) -> f32 {
 #[derive(Debug, Clone)]
 pub struct Part {
     pub kind: Kind,
-    /// 0: left or middle, 1: right. Of skirts: 1 with a coat.
+    /// 0: left or middle, 1: right. For skirts 1 means that there is a coat.
     pub side: usize,
     pub shapes: Vec<Shape>,
-    /// Radius of the curves between the shapes.
+    /// Blending radius between the shapes.
     blend: f32,
-    /// Radius of the curve towards the trunk at the start of the axis. It vanishes along the first half of the axis.
+    /// Blending radius with the trunk at the start of the axis. It vanishes along the first half of the axis.
     pub joint: f32,
     axis: Vec<Bone>,
     /// Metres of cloth per radian around the axis.
@@ -175,7 +175,7 @@ impl Part {
         }
     }
 
-    /// Place of a point on the part's chart: angle around the axis (0 in front, towards +x up to π) and metres along it.
+    /// Chart coordinates of a point: angle around the axis (0 in front, towards +x up to π) and metres along the axis.
     pub fn chart(&self, p: Vec3) -> (f32, f32) {
         let mut best = (f32::INFINITY, 0.0, 0.0);
         let mut before = 0.0;
@@ -200,7 +200,7 @@ impl Part {
         (best.1, best.2)
     }
 
-    /// Metres of cloth over the skin at `p` and its place on the chart.
+    /// Metres of cloth over the skin at `p`, whose chart coordinates are `angle` and `along`.
     fn thickness(&self, p: Vec3, (angle, along): (f32, f32)) -> f32 {
         let mut thickest = 0.0_f32;
         for layer in &self.layers {
@@ -240,7 +240,7 @@ impl Part {
         skin
     }
 
-    /// Distance to the part's surface, from the distance to the skin, which drapes do not have.
+    /// Distance to the part's surface. `skin` is the distance to the skin; drapes ignore it.
     pub fn dressed(&self, p: Vec3, skin: f32) -> f32 {
         match &self.drape {
             Some(drape) => drape.distance(p),

@@ -1,15 +1,14 @@
 //! The surface of a body as triangles.
 
-use std::cmp::Reverse;
-
 use fast_surface_nets::{SurfaceNetsBuffer, surface_nets};
 use glam::{IVec3, Vec3};
 use ndshape::RuntimeShape;
 use rayon::prelude::*;
+use snapsnap_mesh::mesh::pieces;
 
 use super::body::Body;
 
-/// Samples along the edge of a block. Blocks without surface are not sampled, nor are their parts of half the edge.
+/// Samples along the edge of a block. Blocks without surface are not sampled; others are halved recursively.
 const BLOCK: usize = 8;
 /// Largest factor by which distances may be too large where surfaces lean or are crumpled.
 const SLACK: f32 = 1.4;
@@ -19,7 +18,7 @@ const SLACK: f32 = 1.4;
 pub struct Surface {
     pub positions: Vec<Vec3>,
     pub faces: Vec<[u32; 3]>,
-    /// Row of the part that each position lies on.
+    /// Index of the part of each position.
     pub parts: Vec<u8>,
 }
 
@@ -54,7 +53,7 @@ pub fn mesh(body: &Body, cell: f32) -> Surface {
 /// Layers of samples of the distance.
 struct Slab<'a> {
     body: &'a Body,
-    /// Place of the grid's first sample.
+    /// Position of the grid's first sample.
     origin: Vec3,
     /// First layer in the grid.
     first: usize,
@@ -66,13 +65,13 @@ struct Slab<'a> {
 }
 
 impl Slab<'_> {
-    /// Samples a cube of `edge` samples. Where its middle is too far from the surface, it has the middle's distance.
+    /// Samples a cube of `edge` samples. Far from the surface all samples get the distance of the cube's centre.
     fn fill(&mut self, start: [usize; 3], edge: usize) {
         let place = |[x, y, z]: [usize; 3]| {
             self.origin + self.cell * Vec3::new(x as f32, y as f32, (self.first + z) as f32)
         };
         let half = (edge - 1) as f32 / 2.0;
-        // The neighbours of its outermost samples count, too.
+        // The neighbours of the outermost samples count, too.
         let reach = SLACK * self.cell * (3.0_f32.sqrt() * half + 1.0);
         let far = self.body.distance(place(start) + Vec3::splat(self.cell * half), reach).0;
         let corner = |step: usize, i: usize| {
@@ -96,11 +95,11 @@ impl Slab<'_> {
     }
 }
 
-/// Moves a point of the net onto the surface by two steps along the gradient, within its cell. Also returns the row of
-/// its part.
+/// Moves a vertex onto the surface by two steps along the gradient, within its cell. Also returns the index of its
+/// part.
 fn settle(body: &Body, start: Vec3, cell: f32) -> (Vec3, u8) {
     let distance = |p: Vec3| body.distance(p, 4.0 * cell).0;
-    // Corners of a tetrahedron. Opposite points along each axis would be six.
+    // Corners of a tetrahedron: four evaluations, where central differences need six.
     let corners = [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]].map(Vec3::from);
     let step = 0.15 * cell;
     let sum: Vec3 = corners.iter().map(|corner| *corner * distance(start + step * *corner)).sum();
@@ -116,32 +115,17 @@ fn settle(body: &Body, start: Vec3, cell: f32) -> (Vec3, u8) {
 
 /// The connected piece with the most triangles; the others are crumbs of cloth.
 fn largest_piece(positions: Vec<Vec3>, faces: Vec<[u32; 3]>) -> (Vec<Vec3>, Vec<[u32; 3]>) {
-    let mut parent: Vec<u32> = (0..positions.len() as u32).collect();
-    fn root(parent: &mut [u32], mut row: u32) -> u32 {
-        while parent[row as usize] != row {
-            parent[row as usize] = parent[parent[row as usize] as usize];
-            row = parent[row as usize];
-        }
-        row
-    }
-    for face in &faces {
-        let first = root(&mut parent, face[0]);
-        for row in &face[1..] {
-            let other = root(&mut parent, *row);
-            parent[other as usize] = first;
-        }
-    }
-    let roots: Vec<u32> = (0..parent.len() as u32).map(|row| root(&mut parent, row)).collect();
-    let mut sizes = vec![0_u32; roots.len()];
-    faces.iter().for_each(|face| sizes[roots[face[0] as usize] as usize] += 1);
-    let largest = (0..sizes.len()).max_by_key(|row| (sizes[*row], Reverse(*row))).unwrap_or(0) as u32;
-    let mut rows = vec![u32::MAX; roots.len()];
+    let pieces = pieces(positions.len(), faces.iter().map(|face| &face[..]));
+    let mut faces: Vec<[u32; 3]> =
+        faces.into_iter().zip(pieces).filter(|(_, piece)| *piece == 0).map(|(face, _)| face).collect();
+    let mut is_kept = vec![false; positions.len()];
+    faces.as_flattened().iter().for_each(|row| is_kept[*row as usize] = true);
+    let mut rows = vec![u32::MAX; positions.len()];
     let mut kept = Vec::new();
-    for (row, position) in positions.into_iter().enumerate().filter(|(row, _)| roots[*row] == largest) {
+    for (row, position) in positions.into_iter().enumerate().filter(|(row, _)| is_kept[*row]) {
         rows[row] = kept.len() as u32;
         kept.push(position);
     }
-    let faces =
-        faces.into_iter().map(|f| f.map(|row| rows[row as usize])).filter(|f| f[0] != u32::MAX).collect();
+    faces.as_flattened_mut().iter_mut().for_each(|row| *row = rows[*row as usize]);
     (kept, faces)
 }

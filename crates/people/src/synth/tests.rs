@@ -5,8 +5,8 @@ use snapsnap_mesh::mesh::Face;
 
 use super::*;
 
-/// Every edge belongs to two triangles with opposite directions (or to two such pairs, where the surface touches itself), and
-/// all triangles are connected: no holes, no floating parts.
+/// Every edge belongs to two triangles with opposite directions, or to two such pairs where the surface touches
+/// itself. All triangles are connected: no holes, no floating parts.
 #[test]
 fn people_are_closed_and_of_one_piece() {
     for index in 0..6 {
@@ -29,7 +29,7 @@ fn people_are_closed_and_of_one_piece() {
             next.extend(neighbours[&row].iter().filter(|other| reached.insert(**other)));
         }
         assert_eq!(reached.len(), neighbours.len(), "person {index}");
-        // Normals point outwards, and the enclosed volume is that of a person.
+        // Normals point outwards, and the surface has the volume of a person.
         let volume: f32 = mesh
             .faces
             .iter()
@@ -56,7 +56,7 @@ fn hands_and_hips_stay_where_they_belong() {
         }
         let Some(drape) = body.parts.iter().find_map(|part| part.drape) else { continue };
         skirts += 1;
-        // Out from the middle of the hips until the surface is reached.
+        // Outwards from the middle of the hips to the surface.
         for step in 0..24 {
             let (sin, cos) = crate::math::sin_cos(step as f32 * std::f32::consts::PI / 12.0);
             let mut p = Vec3::new(0.0, figure.pelvis.start.y - 0.02, 0.0);

@@ -2,10 +2,11 @@
 
 use cubecl::prelude::*;
 
-use super::job::{Job, Wanted};
+use super::inputs::Wanted;
+use super::job::Job;
 use super::splat::Offset;
 use crate::linear::{Vec3, add3, load3};
-use crate::vjp::FootprintGradient;
+use crate::projection::FootprintGradient;
 
 /// The sums over pixels that the backward pass keeps of one intersection, in this order: colour (3), opacity (1),
 /// geometry (5), depth (1). Unwanted sums have no place.
@@ -21,8 +22,8 @@ impl Record {
     pub fn new(wanted: Wanted, job: &Job) -> Self {
         let (colors, geometry) = (wanted.colors, wanted.geometry());
         // The compensation of antialiasing carries the opacity's gradient on to the geometry.
-        let opacities = wanted.opacities || (geometry && job.antialiased);
-        Self { colors, opacities, geometry, depth: geometry && job.depth }
+        let opacities = wanted.opacities || (geometry && job.options.antialiased);
+        Self { colors, opacities, geometry, depth: geometry && job.options.depth }
     }
 
     /// f32 per intersection.
@@ -71,7 +72,7 @@ impl SplatGradient {
         }
     }
 
-    /// Adds a pixel to the sums r and S: `w` is its offset, `g` the gradient of its power (see [`crate::vjp`]).
+    /// Adds a pixel to the sums r and S: `w` is its offset, `g` the gradient of its power (see [`crate::projection`]).
     #[inline(always)]
     pub fn add_shape(&mut self, g: f32, w: &Offset) {
         let g_0 = g * w.w0;

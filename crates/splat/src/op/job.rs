@@ -1,13 +1,10 @@
-//! Input of one call of the operation, and its counts, as plain host data.
+//! Cameras and options of one call of the operation, and its counts, as plain host data.
 
 use super::splat::{FATES, Uniforms};
 use crate::linear::{Mat3, Vec3};
 use crate::options::{MIN_TRANSMITTANCE, RenderOptions, TILE};
-use crate::vjp::View;
+use crate::projection::View;
 use crate::{Camera, SplatError};
-
-/// Largest image side; keeps pixel coordinates exact in f32 and tile numbers in 32 bits.
-pub const MAX_SIDE: u32 = 32_768;
 
 /// Numbers of visible and of culled Gaussians, summed over the views of a render.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -36,18 +33,19 @@ impl Counts {
     }
 }
 
-/// The cameras and constants of one call, in the form that the kernels use.
+/// Channels of an image: red, green, blue, alpha, and depth if asked for.
+pub fn channels(depth: bool) -> usize {
+    if depth { 5 } else { 4 }
+}
+
+/// The cameras of one call, in the form that the kernels use, and its options.
 #[derive(Debug, Clone)]
 pub struct Job {
     pub(super) views: Vec<View>,
     pub(super) width: usize,
     pub(super) height: usize,
-    pub(super) max_alpha: f32,
-    pub(super) blur: f32,
-    pub(super) near: f32,
-    pub(super) antialiased: bool,
-    pub(super) depth: bool,
-    pub(super) max_intersections: u64,
+    /// Without the background: the operation renders over black.
+    pub(super) options: RenderOptions,
 }
 
 impl Job {
@@ -63,7 +61,7 @@ impl Job {
                 return Err(SplatError::Camera { index, problem });
             }
         }
-        let RenderOptions { max_alpha, blur, near, antialiased, depth, max_intersections, .. } = *options;
+        let RenderOptions { max_alpha, blur, near, .. } = *options;
         let check = |field, holds: bool, allowed| {
             if holds { Ok(()) } else { Err(SplatError::Option { field, allowed }) }
         };
@@ -76,18 +74,13 @@ impl Job {
             views: cameras.iter().map(view).collect(),
             width: first.width as usize,
             height: first.height as usize,
-            max_alpha,
-            blur,
-            near,
-            antialiased,
-            depth,
-            max_intersections,
+            options: RenderOptions { background: None, ..options.clone() },
         })
     }
 
-    /// Channels of the output: red, green, blue, alpha, and depth if asked for.
+    /// Channels of the image.
     pub(super) fn channels(&self) -> usize {
-        if self.depth { 5 } else { 4 }
+        channels(self.options.depth)
     }
 
     /// Sizes and constants of a call with `n` Gaussians.
@@ -99,9 +92,9 @@ impl Job {
             height: self.height as u32,
             tiles_x: self.tiles_x() as u32,
             tiles: (self.tiles_x() * self.tiles_y()) as u32,
-            near: self.near,
-            blur: self.blur,
-            max_alpha: self.max_alpha,
+            near: self.options.near,
+            blur: self.options.blur,
+            max_alpha: self.options.max_alpha,
         }
     }
 
@@ -111,24 +104,6 @@ impl Job {
 
     pub(super) fn tiles_y(&self) -> usize {
         self.height.div_ceil(TILE)
-    }
-}
-
-/// Which tracked inputs need gradients.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub struct Wanted {
-    pub means: bool,
-    pub rotations: bool,
-    pub scales: bool,
-    pub opacities: bool,
-    pub colors: bool,
-    pub background: bool,
-}
-
-impl Wanted {
-    /// Whether the gradient of a mean, rotation or scale is wanted: they share their sums over pixels.
-    pub fn geometry(self) -> bool {
-        self.means || self.rotations || self.scales
     }
 }
 

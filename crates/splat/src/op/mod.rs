@@ -7,6 +7,7 @@ mod cpu;
 mod flex_ndarray;
 mod gpu;
 mod gradient;
+mod inputs;
 mod job;
 mod splat;
 mod twofold;
@@ -24,10 +25,10 @@ use burn::backend::{AutodiffBackend, Backend, ExtensionType, TensorMetadata, bac
 use burn::tensor::{FloatDType, Shape, Slice};
 
 use crate::SplatError;
-pub use job::{Counts, Job, MAX_SIDE, Wanted};
+use inputs::{Inputs, Upstream, Wanted};
+pub use job::{Counts, Job};
 
-/// Tensors of one call, all f32: means `[N,3]`, rotations `[N,4]`, scales `[N,3]`, opacities `[N]`, colours `[N,3]`,
-/// background `[3]`.
+/// Tensors of one call, all f32: means `[N,3]`, rotations `[N,4]`, scales `[N,3]`, opacities `[N]`, colours `[N,3]`.
 #[derive(ExtensionType, Clone, Debug)]
 pub struct SplatInputs<B: Backend> {
     pub(crate) means: FloatTensor<B>,
@@ -35,7 +36,13 @@ pub struct SplatInputs<B: Backend> {
     pub(crate) scales: FloatTensor<B>,
     pub(crate) opacities: FloatTensor<B>,
     pub(crate) colors: FloatTensor<B>,
-    pub(crate) background: FloatTensor<B>,
+}
+
+impl<B: Backend> SplatInputs<B> {
+    fn tensors(self) -> Inputs<FloatTensor<B>> {
+        let Self { means, rotations, scales, opacities, colors } = self;
+        Inputs { means, rotations, scales, opacities, colors }
+    }
 }
 
 /// Colours `[V,H,W,3]`, alphas `[V,H,W,1]` and depths `[V,H,W,1]`. Without the depth channel, `depth` has the alphas.
@@ -54,30 +61,6 @@ const CHANNELS: [Range<usize>; 3] = [0..3, 3..4, 4..5];
 fn channels<B: Backend>(image: FloatTensor<B>, range: Range<usize>) -> FloatTensor<B> {
     let full = Slice::from(..);
     B::float_slice(image, &[full, full, full, Slice::from(range)])
-}
-
-/// ∂L/∂ of the outputs of a call; `None` for outputs without a gradient. The outputs stay separate, since joining
-/// images costs several times their memory.
-#[derive(Debug, Clone, Copy)]
-pub struct Upstream<T> {
-    /// Colours `[V,H,W,3]`.
-    pub color: Option<T>,
-    /// Alphas `[V,H,W,1]`.
-    pub alpha: Option<T>,
-    /// Depths `[V,H,W,1]`.
-    pub depth: Option<T>,
-}
-
-impl<T> Upstream<T> {
-    fn as_ref(&self) -> Upstream<&T> {
-        let Self { color, alpha, depth } = self;
-        Upstream { color: color.as_ref(), alpha: alpha.as_ref(), depth: depth.as_ref() }
-    }
-
-    fn map<U>(self, f: impl Fn(T) -> U) -> Upstream<U> {
-        let Self { color, alpha, depth } = self;
-        Upstream { color: color.map(&f), alpha: alpha.map(&f), depth: depth.map(&f) }
-    }
 }
 
 /// Backends with the splatting operation. Users call [`render`](crate::render()).
@@ -99,24 +82,24 @@ pub trait SplatKernels: Backend {
     ///
     /// # Errors
     /// [`SplatError::TooManyIntersections`].
-    fn forward(inputs: &SplatInputs<Self>, job: &Job, keep: bool) -> Forward<Self>;
+    fn forward(inputs: &Inputs<FloatTensor<Self>>, job: &Job, keep: bool) -> Forward<Self>;
 
-    /// Gradients in the order of the fields of [`SplatInputs`]; `None` for unwanted ones.
+    /// Gradients; `None` for unwanted ones.
     fn backward(
-        inputs: &SplatInputs<Self>,
+        inputs: &Inputs<FloatTensor<Self>>,
         job: &Job,
         state: &Self::State,
         upstream: Upstream<FloatTensor<Self>>,
         wanted: Wanted,
-    ) -> [Option<FloatTensor<Self>>; 6];
+    ) -> Inputs<Option<FloatTensor<Self>>>;
 }
 
 /// The untracked operation on a concrete backend.
-fn splat_untracked<B: SplatKernels>(inputs: SplatInputs<B>, job: &Job) -> SplatOutput<B> {
+fn splat_untracked<B: SplatKernels>(inputs: Inputs<FloatTensor<B>>, job: &Job) -> SplatOutput<B> {
     match B::forward(&inputs, job, false) {
         Ok((image, _, counts)) => {
             let [color, alpha, depth] = CHANNELS;
-            let depth = if job.depth { depth } else { alpha.clone() };
+            let depth = if job.options.depth { depth } else { alpha.clone() };
             SplatOutput {
                 color: channels::<B>(image.clone(), color),
                 alpha: channels::<B>(image.clone(), alpha),
@@ -124,7 +107,7 @@ fn splat_untracked<B: SplatKernels>(inputs: SplatInputs<B>, job: &Job) -> SplatO
                 counts: Ok(counts),
             }
         }
-        Err(error) => failed(inputs.background, error),
+        Err(error) => failed(inputs.colors, error),
     }
 }
 
@@ -142,26 +125,24 @@ struct SplatBackward;
 /// Inputs, call and kept state, for the backward pass.
 #[derive(Debug, Clone)]
 struct Kept<B: SplatKernels> {
-    inputs: SplatInputs<B>,
+    inputs: Inputs<FloatTensor<B>>,
     job: Arc<Job>,
     state: Option<B::State>,
     arrived: Arrived<B>,
 }
 
-impl<B: SplatKernels> Backward<B, 6> for SplatBackward {
+impl<B: SplatKernels> Backward<B, 5> for SplatBackward {
     type State = Kept<B>;
 
-    fn backward(self, ops: Ops<Self::State, 6>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+    fn backward(self, ops: Ops<Self::State, 5>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
         // The node's own gradient is a token: the gradients of the outputs are in `arrived`.
         drop(grads.consume::<B>(&ops.node));
         let Kept { inputs, job, state, arrived } = ops.state;
         let [color, alpha, depth] = std::mem::take(&mut *lock(&arrived));
-        let [means, rotations, scales, opacities, colors, background] =
-            ops.parents.each_ref().map(Option::is_some);
-        let wanted = Wanted { means, rotations, scales, opacities, colors, background };
+        let wanted = Wanted::from_array(ops.parents.each_ref().map(Option::is_some));
         let state = state.expect("kept by the forward pass, which tracks only what succeeded");
         let gradients = B::backward(&inputs, &job, &state, Upstream { color, alpha, depth }, wanted);
-        for (parent, gradient) in ops.parents.into_iter().zip(gradients) {
+        for (parent, gradient) in ops.parents.into_iter().zip(gradients.into_array()) {
             if let Some((parent, gradient)) = parent.zip(gradient) {
                 grads.register::<B>(parent.id, gradient);
             }
@@ -193,31 +174,18 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 impl<B: SplatKernels, C: CheckpointStrategy> SplatBackend for Autodiff<B, C> {
     fn splat(inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self> {
-        let nodes = [
-            inputs.means.node(),
-            inputs.rotations.node(),
-            inputs.scales.node(),
-            inputs.opacities.node(),
-            inputs.colors.node(),
-            inputs.background.node(),
-        ];
-        let inputs = SplatInputs {
-            means: inputs.means.into_primitive(),
-            rotations: inputs.rotations.into_primitive(),
-            scales: inputs.scales.into_primitive(),
-            opacities: inputs.opacities.into_primitive(),
-            colors: inputs.colors.into_primitive(),
-            background: inputs.background.into_primitive(),
-        };
+        let inputs = inputs.tensors();
+        let nodes = inputs.as_ref().map(|tensor| tensor.node()).into_array();
+        let inputs = inputs.map(|tensor| tensor.into_primitive());
         match SplatBackward.prepare::<C>(nodes).compute_bound().stateful() {
             OpsKind::Tracked(prepared) => {
                 let (image, state, counts) = match B::forward(&inputs, &job, true) {
                     Ok((image, state, counts)) => (image, state, counts),
-                    Err(error) => return failed(Self::from_inner(inputs.background), error),
+                    Err(error) => return failed(Self::from_inner(inputs.colors), error),
                 };
                 let arrived = Arrived::<B>::default();
-                let has_depth = job.depth;
-                let kept = Kept { inputs, job, state, arrived: arrived.clone() };
+                let has_depth = job.options.depth;
+                let kept = Kept::<B> { inputs, job, state, arrived: arrived.clone() };
                 let whole = prepared.finish(kept, image.clone());
                 let part = |output: usize| {
                     let part = channels::<B>(image.clone(), CHANNELS[output].clone());
@@ -231,7 +199,7 @@ impl<B: SplatKernels, C: CheckpointStrategy> SplatBackend for Autodiff<B, C> {
                 SplatOutput { color, alpha, depth, counts: Ok(counts) }
             }
             OpsKind::UnTracked(_) => {
-                let SplatOutput { color, alpha, depth, counts } = splat_untracked(inputs, &job);
+                let SplatOutput { color, alpha, depth, counts } = splat_untracked::<B>(inputs, &job);
                 let [color, alpha, depth] = [color, alpha, depth].map(Self::from_inner);
                 SplatOutput { color, alpha, depth, counts }
             }

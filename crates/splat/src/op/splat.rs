@@ -1,7 +1,7 @@
 //! A Gaussian in one view: culling, the tiles that it reaches, its α at a pixel.
 //!
-//! Like [`crate::vjp`], the functions are compiled twice from this one source: as plain Rust for the CPU and, through
-//! CubeCL's `#[cube]`, into the GPU kernels.
+//! Like [`crate::projection`], the functions are compiled twice from this one source: as plain Rust for the CPU and,
+//! through CubeCL's `#[cube]`, into the GPU kernels.
 
 use cubecl::CubeTypeMut;
 use cubecl::prelude::*;
@@ -9,7 +9,7 @@ use cubecl::prelude::*;
 use super::twofold::{exp, to_f32, to_u32};
 use crate::linear::{Quat, Vec3, load3};
 use crate::options::{MIN_ALPHA, TILE};
-use crate::vjp::{Footprint, View, footprint, project, span, to_camera};
+use crate::projection::{Footprint, View, footprint, project, span, to_camera};
 
 /// Values beyond this are treated like infinities: their products leave the range of f32.
 const MAX_MAGNITUDE: f32 = 1e18;
@@ -25,7 +25,7 @@ pub struct Splat {
     /// Centre, pixels.
     pub u: f32,
     pub v: f32,
-    /// Factors of Σ'⁻¹ (see [`crate::vjp`]).
+    /// Factors of Σ'⁻¹ (see [`crate::projection`]).
     pub l0: f32,
     pub k: f32,
     pub l1: f32,
@@ -239,7 +239,7 @@ pub fn tiles_in_row(splat: &Splat, y: u32, uniforms: &Uniforms) -> Extent {
     tiles_of(&pixels_between(splat.u + reached.left, splat.u + reached.right, uniforms.width))
 }
 
-/// Offset of a pixel from a splat's centre in standard deviations, w = F·d (see [`crate::vjp`]).
+/// Offset of a pixel from a splat's centre in standard deviations, w = F·d (see [`crate::projection`]).
 #[derive(CubeType, Clone, Copy, Debug)]
 pub struct Offset {
     pub w0: f32,

@@ -16,7 +16,7 @@ use snapsnap_ops::host;
 
 use crate::config::TrainConfig;
 use crate::networks::{Networks, Rows};
-use crate::optimizer::{MuonSettings, OptimizerConfig};
+use crate::optimizer::{BETA1, EPSILON, MUON_WEIGHT_DECAY, MuonSettings, OptimizerConfig, WEIGHT_DECAY};
 use crate::photometric::Photometric;
 use crate::points::losses;
 use crate::schedule::Schedule;
@@ -172,7 +172,7 @@ fn zero_gradients(device: &Device) -> Found {
         .filter(|name| name.contains("enc_blocks.0.attn.qkv.") || name.contains("enc_norm.bias"))
         .collect();
     let before = trained.rows();
-    let mut optimizer = config.optimizer.init();
+    let mut optimizer = config.optimizer.init(false);
     for _ in 0..STEPS {
         let rows = trained.rows();
         let zeros: Rows = names.iter().map(|name| (name.clone(), rows[name].zeros_like())).collect();
@@ -183,11 +183,10 @@ fn zero_gradients(device: &Device) -> Found {
     for name in &names {
         let is_matrix = name.ends_with("weight");
         let (rate, decay) = match (&config.optimizer.muon, is_matrix) {
-            (Some(MuonSettings { rate, weight_decay, .. }), true) => (*rate, *weight_decay),
-            _ => (config.optimizer.rate, config.optimizer.weight_decay),
+            (Some(MuonSettings { rate }), true) => (*rate, MUON_WEIGHT_DECAY),
+            _ => (config.optimizer.rate, WEIGHT_DECAY),
         };
-        let decays = is_matrix || config.optimizer.decay_all;
-        let kept = if decays { (1.0 - rate * decay).powi(STEPS as i32) } else { 1.0 };
+        let kept = if is_matrix { (1.0 - rate * decay).powi(STEPS as i32) } else { 1.0 };
         let (before, after) = (host(before[name].clone()), host(after[name].clone()));
         all &= finite(&after);
         for (b, a) in before.iter().zip(&after) {
@@ -202,8 +201,8 @@ fn zero_gradients(device: &Device) -> Found {
 /// Updates of four weights, compared with updates in f64.
 fn many_adamw_steps(steps: u64) -> Found {
     const GRADIENTS: [f32; 4] = [1e-12, 1e-20, 1e-30, 1e3];
-    let config = OptimizerConfig { rate: 1e-5, weight_decay: 0.0, ..OptimizerConfig::default() };
-    let optimizer = config.init();
+    let config = OptimizerConfig { rate: 1e-5, ..OptimizerConfig::default() };
+    let optimizer = config.init(false);
     let device = Device::flex();
     let gradient = Tensor::<1>::from_floats(GRADIENTS, &device);
     let (mut values, mut state) = (Tensor::<1>::zeros([4], &device), None);
@@ -211,11 +210,11 @@ fn many_adamw_steps(steps: u64) -> Found {
     for step in 1..=steps {
         let (next, kept) = optimizer.adamw(1.0, false, values, gradient.clone(), 1.0, state);
         (values, state) = (next, Some(kept));
-        let corrections = [config.beta1, config.beta2].map(|beta| 1.0 - beta.powf(step as f64));
+        let corrections = [BETA1, config.beta2].map(|beta| 1.0 - beta.powf(step as f64));
         for (i, g) in GRADIENTS.into_iter().map(f64::from).enumerate() {
-            mean[i] = mean[i] * config.beta1 + g * (1.0 - config.beta1);
+            mean[i] = mean[i] * BETA1 + g * (1.0 - BETA1);
             squares[i] = squares[i] * config.beta2 + g * g * (1.0 - config.beta2);
-            let length = (squares[i] / corrections[1]).sqrt() + config.epsilon;
+            let length = (squares[i] / corrections[1]).sqrt() + EPSILON;
             expected[i] -= config.rate * mean[i] / corrections[0] / length;
         }
     }
@@ -230,7 +229,7 @@ fn ends_of_the_rate() -> Found {
     let (mut worst, mut sound) = (0.0_f64, true);
     for steps in [1_usize, 2, 10, 1000, 1_000_000] {
         for warm_up in [0, 1, 50] {
-            let schedule = Schedule::Cosine { warm_up, end: 0.01 };
+            let schedule = Schedule::Cosine { warm_up };
             let at = |step: usize| schedule.share(step, steps);
             let first = if warm_up == 0 { 1.0 } else { 1.0 / (warm_up as f64 + 1.0) };
             worst = worst.max((at(0) - first).abs());

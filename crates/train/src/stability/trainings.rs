@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::Device;
 use glam::Vec3;
 use snapsnap_data::dataset::{Folder, Split};
-use snapsnap_data::prepare::{DataConfig, Subject};
+use snapsnap_data::prepare::DataConfig;
 use snapsnap_data::sample::Stage1Item;
 use snapsnap_eval::stability::{Case, Found};
 use snapsnap_net::weights::{Source, random_predictor, random_regressors};
@@ -97,7 +97,6 @@ fn trained<T: Task>(
 fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
     let mut data = DataConfig::default();
     (data.views.count, data.views.resolution) = (4, 64);
-    let folder = Folder::create(&root.join("people"), data.description("stability"))?;
     let person = synth::person("stability", None);
     let lit = |factor: f32| {
         let mut mesh = person.clone();
@@ -110,17 +109,16 @@ fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
     // A ball that fills the view of the cameras, which are two metres away.
     let mut ball = person.clone();
     ball.positions.iter_mut().for_each(|p| *p = middle + (*p - middle).normalize_or(Vec3::Y) * 1.45);
-    for (name, mesh) in [("0000", lit(0.01)), ("0001", lit(40.0)), ("0002", small), ("0003", ball)] {
-        data.add(&folder, &Subject::plain(Split::Train, name), &mesh)?;
-    }
-    Ok(Arc::new(folder))
+    let people = [("0000", lit(0.01)), ("0001", lit(40.0)), ("0002", small), ("0003", ball)];
+    let people = people.map(|(name, mesh)| (Split::Train, name.to_owned(), mesh));
+    Ok(data.make(&root.join("people"), "stability", people)?)
 }
 
 fn stiff(factor: f64) -> Result<Found, TrainError> {
     let temporary = temporary()?;
     let folder = extreme_people(temporary.path())?;
     let share = |subject: &str| -> Result<f64, TrainError> {
-        let (_, mask) = folder.picture(Some(Split::Train), subject, 0, false)?;
+        let (_, mask) = folder.person(Some(Split::Train), subject).picture(0, false)?;
         Ok(mask.as_raw().iter().filter(|m| **m > 127).count() as f64 / 4096.0)
     };
     let (small, large) = (share("0002")?, share("0003")?);

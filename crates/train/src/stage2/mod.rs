@@ -14,7 +14,6 @@ use rand::Rng;
 use snapsnap_base::random::stream;
 use snapsnap_data::dataset::Folder;
 use snapsnap_data::sample::{SampleConfig, Stage2, Stage2Item};
-use snapsnap_eval::lpips::Lpips;
 use snapsnap_net::config::{Config, RegressorStart};
 use snapsnap_net::network::{PointMap, PointPredictor, View, anchors};
 use snapsnap_net::steps::Record;
@@ -24,7 +23,7 @@ use snapsnap_ops::{host, mean};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::TrainError;
-use crate::config::{LpipsConfig, Stage1Config, Stage2Config, TrainConfig};
+use crate::config::{Stage1Config, Stage2Config, TrainConfig};
 use crate::data::Data;
 use crate::networks::Networks;
 use crate::photometric::Photometric;
@@ -38,6 +37,8 @@ pub use scene::anisotropy_penalty;
 use scene::{Phase, gaussians, targets};
 use scores::Scores;
 
+/// β: the share of the L1 loss, as published. The rest is the share of the structural dissimilarity.
+const L1_SHARE: f64 = 0.8;
 /// Samples of a preview.
 const PREVIEWS: usize = 3;
 /// Error that is white in previews.
@@ -52,10 +53,6 @@ pub struct GaussianTask {
     seed: u64,
     /// The predictor, unless it is trained as well.
     frozen: Option<Frozen>,
-    /// Perceptual distance, if configured.
-    lpips: Option<Lpips>,
-    /// First step with the perceptual distance.
-    lpips_from: u64,
     data: Data<Stage2Item>,
     /// Scores of the billboard baseline, computed once.
     billboard_scores: OnceLock<Scores>,
@@ -68,7 +65,7 @@ impl GaussianTask {
     /// without autodiff, or `None` if it is trained as well.
     ///
     /// # Errors
-    /// [`TrainError`] if a data set cannot be used with this config, or weights of LPIPS cannot be read.
+    /// [`TrainError`] if a data set cannot be used with this config.
     pub fn new(
         folders: &[Arc<Folder>],
         config: &TrainConfig,
@@ -79,21 +76,12 @@ impl GaussianTask {
         // Second surfaces are trained in stage 1 alone.
         let samples = SampleConfig { points, second_depth: false, ..config.samples() };
         let data = Data::new(folders, config, &samples, Stage2::new)?;
-        let (mut lpips, mut lpips_from) = (None, 0);
-        if let Some(LpipsConfig { weight, after, files }) = &config.stage2.lpips
-            && *weight > 0.0
-        {
-            lpips = Some(Lpips::load(files, &device.clone().inner())?.to_device(device));
-            lpips_from = (after * config.training.steps as f64).ceil() as u64;
-        }
         Ok(Self {
             config: config.networks(),
             loss_config: config.stage2.clone(),
             stage1: config.stage1.clone(),
             seed: config.training.seed,
             frozen: predictor.map(|predictor| Frozen::new(config, predictor)),
-            lpips,
-            lpips_from,
             data,
             billboard_scores: OnceLock::new(),
             device: device.clone(),
@@ -197,13 +185,13 @@ impl Task for GaussianTask {
         &self,
         networks: &Networks,
         items: Vec<Stage2Item>,
-        Moment { step, batch, first, .. }: Moment,
+        Moment { step, first, .. }: Moment,
     ) -> Result<Vec<Part>, TrainError> {
         let (phase, device) = (Phase::new(self.loss_config.curriculum, step), &self.device);
         let mut sums: BTreeMap<&'static str, (f64, Vec<Tensor<1>>)> = BTreeMap::new();
         let config = &self.loss_config;
         for (place, item) in items.iter().enumerate() {
-            let mut random = stream(&format!("stage2/{}/{step}/{batch}/{}", self.seed, first + place));
+            let mut random = stream(&format!("stage2/{}/{step}/{}", self.seed, first + place));
             let count = item.target_cameras.len();
             // While only the Gaussians of the sides are drawn, the target is one of the sides: the last two.
             let first = if phase.views.start == 2 { count - 2 } else { 0 };
@@ -229,13 +217,9 @@ impl Task for GaussianTask {
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
-            if let Some(lpips) = self.lpips.as_ref().filter(|_| step >= self.lpips_from) {
-                let weight = config.lpips.as_ref().map_or(0.0, |lpips| lpips.weight);
-                add("lpips", weight, lpips.distance(image.clone(), target.clone()).mean());
-            }
             let photometric = Photometric::new(image, target);
-            add("l1", config.l1_share, photometric.l1);
-            add("dissimilarity", 1.0 - config.l1_share, 1.0 - photometric.ssim);
+            add("l1", L1_SHARE, photometric.l1);
+            add("dissimilarity", 1.0 - L1_SHARE, 1.0 - photometric.ssim);
             if config.alpha_weight > 0.0 {
                 add("alpha", config.alpha_weight, mean((coverage - mask).abs()));
             }

@@ -14,8 +14,8 @@ use snapsnap_people::makehuman::{self, Library};
 use snapsnap_people::poses::Poses;
 use snapsnap_people::synth;
 
-use super::super::one_of;
 use super::{Common, Person, SPLITS, Work, make, place};
+use crate::arguments::one_of;
 use crate::failure::{Failure, bail};
 use crate::progress::Progress;
 use crate::say;
@@ -115,7 +115,11 @@ impl Generate {
         if self.subjects == 0 || self.subjects > MAX_SUBJECTS {
             bail!("--subjects is {}, must be 1 to {MAX_SUBJECTS}", self.subjects);
         }
-        let poses = self.poses.as_deref().map(Poses::open).transpose()?;
+        let standing = |folder: &Path| {
+            let none = || FileError::unsuitable(folder, "none of its files .bvh has a standing pose");
+            Poses::open(folder)?.ok_or_else(none)
+        };
+        let poses = self.poses.as_deref().map(standing).transpose()?;
         let mut inputs = inputs.to_vec();
         inputs.extend(self.poses.as_deref());
         let split = self.split;

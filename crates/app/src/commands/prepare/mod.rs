@@ -15,13 +15,14 @@ use snapsnap_base::FileError;
 use snapsnap_base::config::{Schema, differences, keys};
 use snapsnap_base::file;
 use snapsnap_base::random::stream;
+use snapsnap_data::Shard;
 use snapsnap_data::dataset::{Folder, Made, Split};
-use snapsnap_data::prepare::{DataConfig, Shard, Subject};
+use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::Mesh;
 
-use super::{check_outputs, is_same_file};
-use crate::failure::Failure;
+use crate::failure::{Failure, bail};
+use crate::output::{check_outputs, is_same_file, outside_data};
 use crate::progress::Progress;
 use crate::{output, say};
 
@@ -118,22 +119,11 @@ impl Common {
 
 /// Refuses a sheet that is no PNG, or that lies in the data set or in its source.
 fn check_preview(sheet: &Path, common: &Common, inputs: &[&Path]) -> Result<(), Failure> {
-    let wrong = |problem: &str| Err(Failure::Input(format!("--preview {}: {problem}", sheet.display())));
     if !sheet.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
-        return wrong("must end in .png");
+        bail!("--preview {}: must end in .png", sheet.display());
     }
     check_outputs(&[sheet], &[])?;
-    let folder = sheet.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
-    for taken in inputs.iter().copied().chain([common.output.as_path()]) {
-        // The folder of a scan contains its materials and textures.
-        let taken = if taken.is_file() { taken.parent().unwrap_or(taken) } else { taken };
-        let taken = if taken.as_os_str().is_empty() { Path::new(".") } else { taken };
-        if taken.canonicalize().is_ok_and(|taken| taken.is_dir() && folder.starts_with(taken)) {
-            return wrong("lies inside the data set or its source");
-        }
-    }
-    Ok(())
+    outside_data(sheet, inputs.iter().copied().chain([common.output.as_path()]))
 }
 
 /// One subject to be made.

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clap::Args;
 use snapsnap_data::dataset::{self, Folder};
 
-use super::super::outside_data;
 use crate::failure::Failure;
+use crate::output::outside_data;
 use crate::progress::Progress;
 use crate::say;
 

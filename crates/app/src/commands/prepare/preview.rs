@@ -25,7 +25,7 @@ pub fn write(path: &Path, folder: &Folder, subjects: &[&Work]) -> Result<(), Fai
     let mut pictures = Vec::new();
     for work in subjects.iter().take(MOST) {
         for view in [front, back, side] {
-            let (color, mask) = folder.picture(Some(work.split), &work.subject, view, false)?;
+            let (color, mask) = folder.person(Some(work.split), &work.subject).picture(view, false)?;
             pictures.push(shrink(&color, &mask));
         }
     }

@@ -10,8 +10,8 @@ use snapsnap_data::scan::{Collection, Source, find};
 use snapsnap_data::smplx;
 use snapsnap_mesh::import;
 
-use super::super::one_of;
 use super::{Common, Person, SPLITS, Work, make};
+use crate::arguments::one_of;
 use crate::failure::Failure;
 use crate::say;
 

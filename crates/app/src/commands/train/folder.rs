@@ -10,10 +10,9 @@ use snapsnap_train::config::TrainConfig;
 use snapsnap_train::log::PREVIEWS;
 use snapsnap_train::run::{CONFIG, FILES, STATE};
 
-use super::super::outside_data;
 use super::Arguments;
 use crate::failure::Failure;
-use crate::output::make_folder;
+use crate::output::{make_folder, outside_data};
 
 /// The file that a training process locks.
 const LOCK: &str = "lock";
@@ -29,9 +28,7 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
     }
     config.training.weights = arguments.weights.clone().or(config.training.weights);
     // Absolute paths, since a run may be continued from another working directory.
-    let lpips = config.stage2.lpips.iter_mut().flat_map(|lpips| &mut lpips.files);
-    let others = config.training.weights.iter_mut().chain(lpips);
-    let paths = config.data.folders.iter_mut().chain(others);
+    let paths = config.data.folders.iter_mut().chain(config.training.weights.iter_mut());
     for path in paths {
         *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
         if path.to_str().is_none() {

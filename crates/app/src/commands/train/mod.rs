@@ -189,11 +189,7 @@ impl<'a> Plan<'a> {
         if let Some(minutes) = arguments.minutes.filter(|minutes| !(*minutes > 0.0 && *minutes <= 1e6)) {
             bail!("--minutes {minutes}: must be more than 0 and at most a million");
         }
-        let mut config = folder::config(arguments)?;
-        if arguments.dry_run {
-            // The estimate includes the steps with the perceptual distance.
-            config.stage2.lpips.iter_mut().for_each(|lpips| lpips.after = 0.0);
-        }
+        let config = folder::config(arguments)?;
         check_data(&config.data.folders)?;
         let folders = config.data.folders.iter().map(|path| Folder::open(path).map(Arc::new));
         let folders = folders.collect::<Result<_, _>>()?;
@@ -371,7 +367,7 @@ fn example(folder: &Folder) -> Option<[PathBuf; 2]> {
         .find(|split| folder.subjects(*split).is_ok_and(|subjects| !subjects.is_empty()))?;
     let subject = folder.subjects(split).ok()?.into_iter().next()?;
     let [front, back, ..] = description.arrangement.four(0, description.views);
-    let pictures = [front, back].map(|view| folder.picture_path(split, &subject, view));
+    let pictures = [front, back].map(|view| folder.person(split, &subject).picture_path(view));
     // Those of a packed data set are no files.
     pictures.iter().all(|path| path.is_file()).then_some(pictures)
 }

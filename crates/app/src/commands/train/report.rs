@@ -115,7 +115,7 @@ fn clock(seconds: f64) -> String {
 pub fn rehearsed(config: &TrainConfig, on: &Device, rehearsal: Rehearsal) {
     let t = &config.training;
     let step = rehearsal.step.as_secs_f64();
-    let samples = (t.batch * t.accumulate) as f64;
+    let samples = t.batch as f64;
     say::out(&format!(
         "device {}: a step of {samples} samples takes {:.3} s, {:.1} samples a second",
         device::describe(&on.clone().inner()),

@@ -5,17 +5,7 @@ use super::*;
 /// A data set of both splits and its packed form, in archives of one subject each.
 fn packed(layout: Layout) -> (tempfile::TempDir, Arc<Folder>, Folder) {
     let (temporary, folder) = small(layout);
-    let config = DataConfig {
-        views: crate::prepare::ViewsConfig {
-            count: 4,
-            resolution: 64,
-            layout,
-            high_resolution: true,
-            ..DataConfig::default().views
-        },
-        ..DataConfig::default()
-    };
-    config.add(&folder, &Subject::plain(Split::Val, "0002"), &block()).expect("adds");
+    config(layout).add(&folder, &Subject::plain(Split::Val, "0002"), &block()).expect("adds");
     let output = temporary.path().join("packed");
     let done = pack(&folder, &output, 1, |_, _| {}).expect("packs");
     assert_eq!((done.subjects, done.archives), (3, 3));
@@ -41,9 +31,10 @@ fn a_packed_set_is_read_as_its_folders() {
                 folder.subjects(split).expect("lists").iter().flat_map(|s| (0..4).map(move |v| (s, v)))
             {
                 let of = |folder: &Folder| {
-                    let seen = folder.view(split, subject, view).expect("reads");
-                    let large = folder.picture(split, subject, view, true).expect("reads");
-                    (seen.color, seen.mask, seen.depth, format!("{:?}", seen.camera), large)
+                    let person = folder.person(split, subject);
+                    let pictures = [false, true].map(|large| person.picture(view, large).expect("reads"));
+                    let map = person.depth(view).expect("reads");
+                    (pictures, map.depth, format!("{:?}", map.camera))
                 };
                 assert!(of(&packed) == of(&folder), "{layout:?}: {subject}, view {view}");
             }
@@ -89,7 +80,7 @@ fn broken_archives_and_indices_are_refused_by_name() {
     assert!(refused().contains("train-000001.tar, which is missing"), "{}", refused());
     fs::copy(root.join("train-000000.tar"), &archive).expect("copies");
     if let Ok(folder) = Folder::open(root) {
-        let wrong = folder.view(TRAIN, "0001", 0).expect_err("refused").to_string();
+        let wrong = folder.person(TRAIN, "0001").picture(0, false).expect_err("refused").to_string();
         assert!(wrong.contains("train-000001.tar: has no train/"), "{wrong}");
     }
     fs::write(&archive, &bytes).expect("writes");
@@ -100,7 +91,8 @@ fn broken_archives_and_indices_are_refused_by_name() {
     changed[first - 512] ^= 1;
     fs::write(&archive, &changed).expect("writes");
     let view = || {
-        Folder::open(root).expect("opens").view(TRAIN, "0001", 0).map(drop).expect_err("refused").to_string()
+        let folder = Folder::open(root).expect("opens");
+        folder.person(TRAIN, "0001").picture(0, false).expect_err("refused").to_string()
     };
     assert!(view().contains("has no train/img/0001/0.png at byte"), "{}", view());
     changed = bytes.clone();
@@ -176,24 +168,13 @@ fn a_subject_without_a_file_or_with_a_full_stop_is_not_packed() {
     assert_eq!(left, [folder.root()], "nothing is left of it");
 }
 
-/// Files of a killed run are removed. Files of a run in progress stay.
+/// What a killed run has left is no data set, and no run adds to it.
 #[test]
-fn what_killed_runs_have_left_is_removed() {
-    let (temporary, folder) = small(Layout::Exact);
-    let at = |name: &str| temporary.path().join(name);
-    for left in [".packed.1", ".packed.2", ".packed.mine", ".other.1"] {
-        fs::create_dir(at(&format!("{left}.unfinished"))).expect("makes");
-        fs::write(at(&format!("{left}.unfinished/archives.csv")), "half").expect("writes");
-        fs::write(at(&format!("{left}.unfinished.lock")), "").expect("writes");
-    }
-    let lock = fs::File::open(at(".packed.2.unfinished.lock")).expect("opens");
-    lock.lock().expect("locks");
-    pack(&folder, &at("packed"), 1 << 30, |_, _| {}).expect("packs");
-    let entries = fs::read_dir(temporary.path()).expect("lists").map(|e| e.expect("entry").file_name());
-    let mut names: Vec<_> = entries.map(|name| name.into_string().expect("UTF-8")).collect();
-    names.retain(|name| name.starts_with('.'));
-    names.sort();
-    let kept = [".other.1", ".packed.2", ".packed.mine"];
-    let kept = kept.map(|name| [format!("{name}.unfinished"), format!("{name}.unfinished.lock")]);
-    assert_eq!(names, kept.concat());
+fn what_a_killed_run_has_left_is_refused() {
+    let (_temporary, folder, packed) = packed(Layout::Exact);
+    fs::remove_file(packed.root().join(DESCRIPTION)).expect("removes");
+    let refused = Folder::open(packed.root()).expect_err("refused").to_string();
+    assert!(refused.contains("is no data set: it has no dataset.toml"), "{refused}");
+    let refused = pack(&folder, packed.root(), 1, |_, _| {}).expect_err("refused").to_string();
+    assert!(refused.contains("is not empty; give another folder"), "{refused}");
 }

@@ -28,12 +28,6 @@ fn data_of_armed(resolution: u32) -> (TempDir, Arc<Folder>) {
     made(&config, &armed(), 1)
 }
 
-/// The valid points of the map number `map`.
-fn there(points: &[f32], valid: &[f32], map: usize, side: usize) -> Vec<Vec3> {
-    let (points, valid) = (&points[3 * map * side * side..], &valid[map * side * side..][..side * side]);
-    points_of(points).zip(valid).filter(|(_, valid)| **valid > 0.5).map(|(point, _)| point).collect()
-}
-
 #[test]
 fn samples_carry_the_flank_behind_an_arm() {
     let side = 128;
@@ -62,7 +56,7 @@ fn samples_carry_the_flank_behind_an_arm() {
     assert!(without.second_points.is_empty() && without.second_valid.is_empty());
 
     // A mirrored sample has the left's second surface, mirrored, on the right.
-    let flip = SampleConfig { augment: Augment { flip: true, ..Augment::none() }, ..samples.clone() };
+    let flip = SampleConfig { augment: Augment { flip: true, ..Augment::none() }, ..samples };
     let flipped = (0..16).map(|index| sample(flip.clone(), index)).find(|item| item.points != plain.points);
     let flipped = flipped.expect("one of sixteen is mirrored");
     for (map, other) in [(0, 1), (1, 0)] {
@@ -79,7 +73,7 @@ fn samples_carry_the_flank_behind_an_arm() {
 
     // The second surfaces of placed samples lie on the rays of the nominal cameras.
     let placed =
-        sample(SampleConfig { placed_share: 1.0, upright: true, person_height: 700, ..samples.clone() }, 0);
+        sample(SampleConfig { second_depth: true, front_within_degrees: 0.0, ..groups::placed() }, 0);
     assert_ne!(placed.second_points, plain.second_points);
     for (map, degrees) in [(0, 90.0), (1, 270.0)] {
         let camera = Camera::orbit_at_yaw_degrees(degrees, side as u32);
@@ -141,8 +135,5 @@ fn second_surfaces_need_data_that_has_them() {
     let (_temporary, folder) = data_set(&block(), Layout::Exact, 16, 4, false, 1);
     let samples = SampleConfig { second_depth: true, ..SampleConfig::default() };
     let error = Stage1::new(folder, TRAIN, samples).expect_err("has none").to_string();
-    assert!(error.contains("has no second surfaces, which `second_depth` needs"), "{error}");
-    let (key, _) =
-        SampleConfig { second_depth: true, ..SampleConfig::compat() }.problem().expect("a problem");
-    assert_eq!(key, "second_depth");
+    assert!(error.contains("has no second surfaces, which `network.second_layer` needs"), "{error}");
 }

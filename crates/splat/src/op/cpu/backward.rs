@@ -3,49 +3,32 @@
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::super::Upstream;
 use super::super::gradient::{Record, SplatGradient};
-use super::super::job::{Job, Wanted};
+use super::super::inputs::{Inputs, Upstream, Wanted};
+use super::super::job::Job;
 use super::lanes::{BATCH, Lanes, fetch, row, rows};
 use super::splats::{Visible, projection};
 use super::{Scene, State, ViewState};
 use crate::linear::Vec3;
 use crate::options::{MIN_ALPHA, TILE};
-use crate::vjp::{FootprintGradient, project_vjp};
+use crate::projection::{FootprintGradient, project_vjp};
 
 /// Gaussians per task.
 const CHUNK: usize = 2048;
 
-/// Gradients in the shapes of the inputs; empty if unwanted.
-#[derive(Debug, Default)]
-pub struct Gradients {
-    pub means: Vec<f32>,
-    pub rotations: Vec<f32>,
-    pub scales: Vec<f32>,
-    pub opacities: Vec<f32>,
-    pub colors: Vec<f32>,
-    pub background: Vec<f32>,
-}
-
-/// Gradients of the inputs that `wanted` names.
+/// Gradients in the shapes of the inputs; `None` for unwanted ones.
 pub fn backward(
     scene: Scene,
     job: &Job,
     state: &State,
     upstream: &Upstream<&[f32]>,
     wanted: Wanted,
-) -> Gradients {
-    let n = scene.len();
-    let room = |columns: usize, wanted: bool| vec![0.0_f32; if wanted { n * columns } else { 0 }];
-    let mut gradients = Gradients {
-        means: room(3, wanted.means),
-        rotations: room(4, wanted.rotations),
-        scales: room(3, wanted.scales),
-        opacities: room(1, wanted.opacities),
-        colors: room(3, wanted.colors),
-        background: vec![0.0; if wanted.background { 3 } else { 0 }],
-    };
+) -> Inputs<Option<Vec<f32>>> {
+    let mut gradients = scene.with(wanted, |input, wanted| wanted.then(|| vec![0.0; input.len()]));
     let record = Record::new(wanted, job);
+    if record.len() == 0 {
+        return gradients;
+    }
     let count = job.width * job.height;
     for (index, view) in state.views.iter().enumerate() {
         let Upstream { color, alpha, depth } = *upstream;
@@ -54,39 +37,14 @@ pub fn backward(
             alpha: alpha.map(|values| &values[index * count..][..count]),
             depth: depth.map(|values| &values[index * count..][..count]),
         };
-        if let Some(color) = upstream.color.filter(|_| wanted.background) {
-            let sums = background(view, job, color);
-            gradients.background.iter_mut().zip(sums).for_each(|(g, s)| *g += s);
-        }
-        if record.len() > 0 {
-            let records = pixels(scene, job, view, upstream, record);
-            gather(scene, job, index, view, &records, record, &mut gradients);
-        }
+        let records = pixels(job, view, upstream, record);
+        gather(scene, job, index, view, &records, record, &mut gradients);
     }
     gradients
 }
 
-/// ∂L/∂background = Σ T_final·v_colour, image row by image row in f64.
-fn background(view: &ViewState, job: &Job, color: &[f32]) -> [f32; 3] {
-    let rows: Vec<[f64; 3]> = view
-        .transmittance
-        .par_chunks(job.width)
-        .zip(color.par_chunks(3 * job.width))
-        .map(|(transmittance, color)| {
-            let mut sum = [0.0; 3];
-            for (t, v) in transmittance.iter().zip(color.chunks_exact(3)) {
-                for c in 0..3 {
-                    sum[c] += f64::from(t * v[c]);
-                }
-            }
-            sum
-        })
-        .collect();
-    [0, 1, 2].map(|c| rows.iter().map(|sum| sum[c]).sum::<f64>() as f32)
-}
-
 /// One record of sums over pixels for each entry of the tiles' lists, in the order of the entries.
-fn pixels(scene: Scene, job: &Job, view: &ViewState, upstream: Upstream<&[f32]>, record: Record) -> Vec<f32> {
+fn pixels(job: &Job, view: &ViewState, upstream: Upstream<&[f32]>, record: Record) -> Vec<f32> {
     let mut records = vec![0.0_f32; view.lists.len() * record.len()];
     let mut rest = records.as_mut_slice();
     let mut bands = Vec::with_capacity(job.tiles_y());
@@ -95,7 +53,7 @@ fn pixels(scene: Scene, job: &Job, view: &ViewState, upstream: Upstream<&[f32]>,
         let entries = view.lists.starts[tiles.end] - view.lists.starts[tiles.start];
         let (records, others) = rest.split_at_mut(entries as usize * record.len());
         rest = others;
-        bands.push(Band { job, view, upstream, background: scene.background(), y, records, record });
+        bands.push(Band { job, view, upstream, y, records, record });
     }
     let arch = Arch::new();
     bands.into_par_iter().for_each(|band| arch.dispatch(band));
@@ -107,7 +65,6 @@ struct Band<'a> {
     job: &'a Job,
     view: &'a ViewState,
     upstream: Upstream<&'a [f32]>,
-    background: [f32; 3],
     y: usize,
     records: &'a mut [f32],
     record: Record,
@@ -117,7 +74,7 @@ struct Band<'a> {
 struct Pixels {
     /// Transmittance in front of the splat that was visited last.
     transmittance: [Lanes; TILE],
-    /// Σ α_j T_j e_j over the splats behind, plus the background's part (see [`crate::vjp`]).
+    /// Σ α_j T_j e_j over the splats behind (see [`crate::projection`]).
     behind: [Lanes; TILE],
     last: [[u32; TILE]; TILE],
     /// ∂L/∂(red, green, blue, alpha, depth).
@@ -142,7 +99,7 @@ impl WithSimd for Band<'_> {
     fn with_simd<S: Simd>(mut self, _simd: S) {
         let colors_only = !self.record.geometry && !self.record.opacities;
         for x in 0..self.job.tiles_x() {
-            match (colors_only, self.job.depth) {
+            match (colors_only, self.job.options.depth) {
                 (true, _) => self.tile::<false, false>(x),
                 (false, false) => self.tile::<true, false>(x),
                 (false, true) => self.tile::<true, true>(x),
@@ -165,6 +122,7 @@ impl Band<'_> {
         let first =
             (self.view.lists.starts[tile] - self.view.lists.starts[self.y * self.job.tiles_x()]) as usize;
         let (left, top) = ((x * TILE) as f32, self.y * TILE);
+        let max_alpha = self.job.options.max_alpha;
         let mut batch = [Visible::default(); BATCH];
         for (begin, entries) in (0..visited).step_by(BATCH).zip(list[..visited].chunks(BATCH)).rev() {
             fetch(&self.view.splats, entries, &mut batch);
@@ -177,16 +135,7 @@ impl Band<'_> {
                     depth: [0.0; TILE],
                 };
                 for y in rows(splat, top) {
-                    take_off::<SHAPE, DEPTH>(
-                        &mut p,
-                        &mut sums,
-                        splat,
-                        n as u32,
-                        left,
-                        top,
-                        y,
-                        self.job.max_alpha,
-                    );
+                    take_off::<SHAPE, DEPTH>(&mut p, &mut sums, splat, n as u32, left, top, y, max_alpha);
                 }
                 let at = (first + n) * self.record.len();
                 write(&sums, splat, self.record, &mut self.records[at..at + self.record.len()]);
@@ -213,10 +162,6 @@ impl Band<'_> {
                 for (i, v) in color.chunks_exact(3).enumerate() {
                     for c in 0..3 {
                         p.upstream[c][y][i] = v[c];
-                    }
-                    if SHAPE {
-                        let b = self.background;
-                        p.behind[y][i] = p.transmittance[y][i] * (b[0] * v[0] + b[1] * v[1] + b[2] * v[2]);
                     }
                 }
             }
@@ -320,17 +265,18 @@ fn gather(
     view: &ViewState,
     records: &[f32],
     record: Record,
-    gradients: &mut Gradients,
+    gradients: &mut Inputs<Option<Vec<f32>>>,
 ) {
     let mut splat_of = vec![u32::MAX; scene.len()];
     for (i, splat) in view.splats.iter().enumerate() {
         splat_of[splat.gaussian as usize] = i as u32;
     }
-    let mut means = gradients.means.chunks_mut(3 * CHUNK);
-    let mut rotations = gradients.rotations.chunks_mut(4 * CHUNK);
-    let mut scales = gradients.scales.chunks_mut(3 * CHUNK);
-    let mut opacities = gradients.opacities.chunks_mut(CHUNK);
-    let mut colors = gradients.colors.chunks_mut(3 * CHUNK);
+    // No chunk for an unwanted gradient.
+    let mut means = gradients.means.as_deref_mut().unwrap_or_default().chunks_mut(3 * CHUNK);
+    let mut rotations = gradients.rotations.as_deref_mut().unwrap_or_default().chunks_mut(4 * CHUNK);
+    let mut scales = gradients.scales.as_deref_mut().unwrap_or_default().chunks_mut(3 * CHUNK);
+    let mut opacities = gradients.opacities.as_deref_mut().unwrap_or_default().chunks_mut(CHUNK);
+    let mut colors = gradients.colors.as_deref_mut().unwrap_or_default().chunks_mut(3 * CHUNK);
     let tasks: Vec<_> = splat_of
         .chunks(CHUNK)
         .map(|splats| {
@@ -363,7 +309,8 @@ fn gather(
             }
             if record.geometry {
                 let gaussian = scene.gaussian(splat.gaussian as usize);
-                let v_compensation = if job.antialiased { sums.opacity * gaussian.opacity } else { 0.0 };
+                let v_compensation =
+                    if job.options.antialiased { sums.opacity * gaussian.opacity } else { 0.0 };
                 let p = projection(&gaussian, camera, job);
                 let v = project_vjp(camera, &p, &gaussian.scale, &sums.footprint, v_compensation);
                 if !means.is_empty() {

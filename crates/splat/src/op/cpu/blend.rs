@@ -8,9 +8,9 @@ use super::lanes::{BATCH, Lanes, fetch, row, rows};
 use super::{ViewState, splats::Visible, tiles::Lists};
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 
-/// Composites `view` over `background` into `image` `[H,W,C]`. If the buffers of `view` are not empty, stores each
-/// pixel's final transmittance and last splat in them.
-pub fn blend(view: &mut ViewState, background: [f32; 3], job: &Job, image: &mut [f32]) {
+/// Composites `view` over black into `image` `[H,W,C]`, which is zero before. If the buffers of `view` are not empty,
+/// stores each pixel's final transmittance and last splat in them, but not for tiles without splats.
+pub fn blend(view: &mut ViewState, job: &Job, image: &mut [f32]) {
     let band = TILE * job.width;
     let keep = !view.last.is_empty();
     let mut transmittance = view.transmittance.chunks_mut(band);
@@ -22,7 +22,6 @@ pub fn blend(view: &mut ViewState, background: [f32; 3], job: &Job, image: &mut 
             splats: &view.splats,
             lists: &view.lists,
             job,
-            background,
             y,
             image,
             kept: keep.then(|| transmittance.next().zip(last.next())).flatten(),
@@ -37,7 +36,6 @@ struct Band<'a> {
     splats: &'a [Visible],
     lists: &'a Lists,
     job: &'a Job,
-    background: [f32; 3],
     /// Number of the row of tiles.
     y: usize,
     /// `[≤16,W,C]`.
@@ -54,8 +52,9 @@ impl WithSimd for Band<'_> {
         for x in 0..self.job.tiles_x() {
             let list = self.lists.tile(self.y * self.job.tiles_x() + x);
             if list.is_empty() {
-                self.write_empty(x);
-            } else if self.job.depth {
+                continue;
+            }
+            if self.job.options.depth {
                 self.tile::<true>(x, list);
             } else {
                 self.tile::<false>(x, list);
@@ -86,25 +85,6 @@ impl Band<'_> {
         TILE.min(self.job.width - x * TILE)
     }
 
-    /// Writes the background into a tile without splats.
-    #[inline(always)]
-    fn write_empty(&mut self, x: usize) {
-        let (columns, channels) = (self.columns(x), self.job.channels());
-        for y in 0..self.height() {
-            let first = y * self.job.width + x * TILE;
-            if self.background != [0.0; 3] {
-                let pixels = &mut self.image[first * channels..(first + columns) * channels];
-                for pixel in pixels.chunks_exact_mut(channels) {
-                    pixel[..3].copy_from_slice(&self.background);
-                }
-            }
-            // The image and `last` are zero from the start.
-            if let Some((transmittance, _)) = &mut self.kept {
-                transmittance[first..first + columns].fill(1.0);
-            }
-        }
-    }
-
     #[inline(always)]
     fn tile<const DEPTH: bool>(&mut self, x: usize, list: &[u32]) {
         let (columns, height) = (self.columns(x), self.height());
@@ -121,12 +101,13 @@ impl Band<'_> {
         }
         let mut rows_alive = height;
         let (left, top) = ((x * TILE) as f32, self.y * TILE);
+        let max_alpha = self.job.options.max_alpha;
         let mut batch = [Visible::default(); BATCH];
         for (first, entries) in (0..).step_by(BATCH).zip(list.chunks(BATCH)) {
             fetch(self.splats, entries, &mut batch);
             for (n, splat) in (first + 1..).zip(&batch[..entries.len()]) {
                 for y in rows(splat, top) {
-                    if p.alive[y] && add::<DEPTH>(&mut p, splat, n, left, top, y, self.job.max_alpha) {
+                    if p.alive[y] && add::<DEPTH>(&mut p, splat, n, left, top, y, max_alpha) {
                         p.alive[y] = p.open[y].iter().any(|&t| t > 0.0);
                         rows_alive -= usize::from(!p.alive[y]);
                     }
@@ -146,11 +127,10 @@ impl Band<'_> {
             let first = y * self.job.width + x * TILE;
             let pixels = &mut self.image[first * channels..(first + columns) * channels];
             for (i, pixel) in pixels.chunks_exact_mut(channels).enumerate() {
-                let t = p.transmittance[y][i];
                 for c in 0..3 {
-                    pixel[c] = p.sums[c][y][i] + t * self.background[c];
+                    pixel[c] = p.sums[c][y][i];
                 }
-                pixel[3] = 1.0 - t;
+                pixel[3] = 1.0 - p.transmittance[y][i];
                 if let Some(depth) = pixel.get_mut(4) {
                     *depth = p.sums[3][y][i];
                 }

@@ -6,7 +6,7 @@ use super::super::job::Job;
 use super::super::splat::{Extent, FATES, Gaussian, Projected, Splat, VISIBLE, splat};
 use super::Scene;
 use crate::linear::load3;
-use crate::vjp::{Projection, View, project, to_camera};
+use crate::projection::{Projection, View, project, to_camera};
 
 /// Gaussians per task.
 const CHUNK: usize = 4096;
@@ -39,7 +39,7 @@ pub fn visible(scene: Scene, view: &View, job: &Job, fates: &mut [u64; FATES]) -
             for g in chunk * CHUNK..((chunk + 1) * CHUNK).min(scene.len()) {
                 let color = load3(scene.colors, 3 * g);
                 let Projected { splat, compensation, rows, tiles, fate } =
-                    splat(view, &scene.gaussian(g), &color, &uniforms, job.antialiased);
+                    splat(view, &scene.gaussian(g), &color, &uniforms, job.options.antialiased);
                 fates[fate as usize] += 1;
                 if fate == VISIBLE {
                     let color = [color.x, color.y, color.z];
@@ -70,5 +70,5 @@ pub fn visible(scene: Scene, view: &View, job: &Job, fates: &mut [u64; FATES]) -
 
 /// Projection of a Gaussian that [`visible`] accepted.
 pub fn projection(gaussian: &Gaussian, view: &View, job: &Job) -> Projection {
-    project(view, &to_camera(view, &gaussian.mean), &gaussian.rotation, &gaussian.scale, job.blur)
+    project(view, &to_camera(view, &gaussian.mean), &gaussian.rotation, &gaussian.scale, job.options.blur)
 }

@@ -45,7 +45,7 @@ impl Lists {
 /// # Errors
 /// [`SplatError::TooManyIntersections`] beyond [`MAX_ENTRIES`], [`MAX_KEPT`] or the job's own limit.
 pub fn lists(splats: &[Visible], job: &Job, keep_places: bool) -> Result<Lists, SplatError> {
-    let limit = if keep_places { MAX_KEPT } else { MAX_ENTRIES }.min(job.max_intersections);
+    let limit = if keep_places { MAX_KEPT } else { MAX_ENTRIES }.min(job.options.max_intersections);
     let found = splats.iter().map(|splat| u64::from(splat.tiles)).sum();
     if found > limit {
         return Err(SplatError::TooManyIntersections { found, limit });

@@ -12,14 +12,14 @@ use cubecl::CubeTypeMut;
 use cubecl::prelude::*;
 
 use super::blend::{Pixel, TileLists, UNITS, pixel_of_unit};
-use super::channels;
 use super::project::{Parameters, Reach, load_view};
 use crate::linear::{Quat, Vec3, add3, dot, load3, store3};
 use crate::op::gradient::{Record, SplatGradient};
-use crate::op::job::Wanted;
+use crate::op::inputs::Wanted;
+use crate::op::job::channels;
 use crate::op::splat::{Offset, Splat, Uniforms, offset, unclamped_alpha};
 use crate::options::MIN_ALPHA;
-use crate::vjp::{GaussianGradient, footprint, project, project_vjp, to_camera};
+use crate::projection::{GaussianGradient, footprint, project, project_vjp, to_camera};
 
 /// Splats that a cube visits between two barriers.
 const ROUND: usize = 8;
@@ -41,7 +41,7 @@ struct Upstream {
 struct BackToFront {
     /// Transmittance in front of the splat that was visited last.
     transmittance: f32,
-    /// Σ α_j T_j e_j over the splats behind, plus the background's part (see [`crate::vjp`]).
+    /// Σ α_j T_j e_j over the splats behind (see [`crate::projection`]).
     sum: f32,
 }
 
@@ -56,7 +56,7 @@ struct PixelTerms {
 
 #[cube]
 impl BackToFront {
-    /// Visits the next splat towards the camera. `e` is e_j in [`crate::vjp`].
+    /// Visits the next splat towards the camera. `e` is e_j in [`crate::projection`].
     fn step_past(&mut self, unclamped_alpha: f32, e: f32, max_alpha: f32) -> PixelTerms {
         let alpha = unclamped_alpha.min(max_alpha);
         let inverse = 1.0 / (1.0 - alpha);
@@ -70,14 +70,13 @@ impl BackToFront {
 }
 
 /// Fills `records` `[intersections, record.len()]` from `upstream` `[V,H,W,C]`. `splats` `[V·N,8]`, `colors` `[N,3]`,
-/// `background` `[3]`; `slots` has the slot of each entry; `transmittance` `[V·H·W]` is behind all splats;
+/// `slots` has the slot of each entry; `transmittance` `[V·H·W]` is behind all splats;
 /// `list_ends` `[V·H·W]` is one more than the place, in the tile's list, of the last splat that a pixel blended.
 #[cube(launch)]
 #[allow(clippy::too_many_arguments, reason = "a kernel takes its buffers one by one")]
 pub fn pixels(
     splats: &[f32],
     colors: &[f32],
-    background: &[f32],
     lists: &TileLists,
     slots: &[u32],
     transmittance: &[f32],
@@ -107,7 +106,6 @@ pub fn pixels(
         own = load_upstream(upstream, &pixel, depth);
         list_end = list_ends[pixel.index];
         visit.transmittance = transmittance[pixel.index];
-        visit.sum = visit.transmittance * dot(&load3(background, 0usize), &own.color);
     }
     upstreams[unit] = own.color.x;
     upstreams[comptime!(UNITS) + unit] = own.color.y;
@@ -341,43 +339,5 @@ pub fn gather(
     }
     if comptime!(wanted.scales) {
         store3(v_scales, 3 * g, &total.scale);
-    }
-}
-
-/// ∂L/∂background of each image row: `rows` `[V·H, 3]`.
-#[cube(launch)]
-pub fn background_rows(
-    transmittance: &[f32],
-    upstream: &[f32],
-    rows: &mut [f32],
-    uniforms: &Uniforms,
-    #[comptime] depth: bool,
-) {
-    let row = ABSOLUTE_POS;
-    let width = uniforms.width as usize;
-    if row >= uniforms.views * uniforms.height as usize {
-        terminate!();
-    }
-    let mut sum = Vec3 { x: 0.0f32, y: 0.0f32, z: 0.0f32 };
-    for x in 0..width {
-        let pixel = row * width + x;
-        let t = transmittance[pixel];
-        let color = load3(upstream, pixel * comptime!(channels(depth)));
-        sum.x += t * color.x;
-        sum.y += t * color.y;
-        sum.z += t * color.z;
-    }
-    store3(rows, 3 * row, &sum);
-}
-
-/// ∂L/∂background: the sum over the image rows.
-#[cube(launch)]
-pub fn background_sum(rows: &[f32], out: &mut [f32], count: usize) {
-    if ABSOLUTE_POS < 3 {
-        let mut sum = 0.0f32;
-        for row in 0..count {
-            sum += rows[3 * row + ABSOLUTE_POS];
-        }
-        out[ABSOLUTE_POS] = sum;
     }
 }

@@ -2,8 +2,8 @@
 
 use cubecl::prelude::*;
 
-use super::channels;
 use crate::linear::{Vec3, load3, store3};
+use crate::op::job::channels;
 use crate::op::splat::{SPLAT, Splat, Uniforms, offset, unclamped_alpha};
 use crate::options::{MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 
@@ -55,7 +55,6 @@ pub fn pixel_of_unit(unit: u32, uniforms: &Uniforms) -> Pixel {
 pub fn blend(
     splats: &[f32],
     colors: &[f32],
-    background: &[f32],
     lists: &TileLists,
     image: &mut [f32],
     transmittance: &mut [f32],
@@ -128,9 +127,9 @@ pub fn blend(
 
     if pixel.inside {
         let at = pixel.index * comptime!(channels(depth));
-        image[at] = color.x + t * background[0];
-        image[at + 1] = color.y + t * background[1];
-        image[at + 2] = color.z + t * background[2];
+        image[at] = color.x;
+        image[at + 1] = color.y;
+        image[at + 2] = color.z;
         image[at + 3] = 1.0 - t;
         if comptime!(depth) {
             image[at + 4] = deep;

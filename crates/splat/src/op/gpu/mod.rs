@@ -20,8 +20,9 @@ mod tests;
 
 use std::sync::Arc;
 
+use burn::backend::TensorMetadata;
 use burn::backend::ops::FloatTensorOps;
-use burn::backend::tensor::{Device, FloatTensor};
+use burn::backend::tensor::Device;
 use burn::tensor::{DType, FloatDType, Shape, Slice};
 use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
@@ -30,11 +31,10 @@ use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
 use super::gradient::Record;
-use super::job::{Counts, Job, Wanted};
+use super::inputs::{Inputs, Upstream, Wanted};
+use super::job::{Counts, Job};
 use super::splat::{FATES, SPLAT, UniformsLaunch};
-use super::{
-    CHANNELS, Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, Upstream, splat_untracked,
-};
+use super::{CHANNELS, Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, splat_untracked};
 use crate::SplatError;
 use blend::TileListsLaunch;
 use buffers::Buffers;
@@ -44,11 +44,6 @@ use project::{ParametersLaunch, REACH, STATISTICS};
 const UNITS: u32 = 256;
 /// Most numbers in a record of the backward pass.
 const RECORD: u64 = 10;
-
-/// Channels of the image, for kernels.
-fn channels(depth: bool) -> usize {
-    if depth { 5 } else { 4 }
-}
 
 /// Values that the backward pass needs.
 #[derive(Debug, Clone)]
@@ -82,18 +77,18 @@ impl Lists {
 
 impl SplatBackend for CubeBackend {
     fn splat(inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self> {
-        splat_untracked(inputs, &job)
+        splat_untracked(inputs.tensors(), &job)
     }
 }
 
 impl SplatKernels for CubeBackend {
     type State = State;
 
-    fn forward(inputs: &SplatInputs<Self>, job: &Job, keep: bool) -> Forward<Self> {
-        let inputs = contiguous(inputs);
+    fn forward(inputs: &Inputs<CubeTensor>, job: &Job, keep: bool) -> Forward<Self> {
         let buffers = Buffers::of(&inputs.means);
+        let scene = Scene::of(inputs, &buffers);
         let views = buffers.upload(bytemuck::cast_slice(&job.views));
-        let (splats, reach, lists, counts) = lists(&buffers, &inputs, &views, job, keep)?;
+        let (splats, reach, lists, counts) = lists(&buffers, &scene, &views, job, keep)?;
 
         let shape = [job.views.len(), job.height, job.width, job.channels()];
         buffers.check("the image", shape.iter().product())?;
@@ -106,14 +101,13 @@ impl SplatKernels for CubeBackend {
             buffers.cubes(all_tiles),
             CubeDim::new_1d(blend::UNITS as u32),
             splats.clone().into_buffer_arg(),
-            inputs.colors.clone().into_buffer_arg(),
-            inputs.background.clone().into_buffer_arg(),
+            scene.inputs.colors.clone().into_buffer_arg(),
             lists.launch(),
             image.clone().into_buffer_arg(),
             transmittance.clone().into_buffer_arg(),
             last.clone().into_buffer_arg(),
-            inputs.uniforms(job),
-            job.depth,
+            scene.uniforms(job),
+            job.options.depth,
             keep,
         );
         let state = State { views, splats, reach, lists, transmittance, last };
@@ -121,49 +115,42 @@ impl SplatKernels for CubeBackend {
     }
 
     fn backward(
-        inputs: &SplatInputs<Self>,
+        inputs: &Inputs<CubeTensor>,
         job: &Job,
         state: &State,
-        upstream: Upstream<FloatTensor<Self>>,
+        upstream: Upstream<CubeTensor>,
         wanted: Wanted,
-    ) -> [Option<FloatTensor<Self>>; 6] {
-        let inputs = contiguous(inputs);
-        let upstream = whole(upstream, job, &inputs.means.device);
+    ) -> Inputs<Option<CubeTensor>> {
         let buffers = Buffers::of(&inputs.means);
-        let n = inputs.len;
-        let room = |shape: [usize; 2], wanted: bool| wanted.then(|| gradient(&buffers, shape));
-        let means = room([n, 3], wanted.means);
-        let rotations = room([n, 4], wanted.rotations);
-        let scales = room([n, 3], wanted.scales);
-        let colors = room([n, 3], wanted.colors);
-        let opacities = wanted.opacities.then(|| gradient(&buffers, [n]));
-        let background = wanted.background.then(|| background(&buffers, &inputs, job, state, &upstream));
+        let scene = Scene::of(inputs, &buffers);
+        let upstream = whole(upstream, job, &buffers.device);
+        let gradients = inputs.as_ref().with(wanted, |input, wanted| wanted.then(|| like(input, &buffers)));
         let record = Record::new(wanted, job);
-        if record.len() > 0 && n > 0 {
-            let records = records(&buffers, &inputs, job, state, upstream, record);
+        if record.len() > 0 && scene.len > 0 {
+            let records = records(&buffers, &scene, job, state, upstream, record);
             let unused = |tensor: &Option<CubeTensor>| {
                 tensor.clone().unwrap_or_else(|| buffers.f32(1)).into_buffer_arg()
             };
             backward::gather::launch(
                 &buffers.client,
-                buffers.cubes(n.div_ceil(UNITS as usize)),
+                buffers.cubes(scene.len.div_ceil(UNITS as usize)),
                 CubeDim::new_1d(UNITS),
-                inputs.parameters(),
+                scene.parameters(),
                 state.views.clone().into_buffer_arg(),
                 state.reach.clone().into_buffer_arg(),
                 records.into_buffer_arg(),
-                unused(&means),
-                unused(&rotations),
-                unused(&scales),
-                unused(&opacities),
-                unused(&colors),
-                inputs.uniforms(job),
-                job.antialiased,
+                unused(&gradients.means),
+                unused(&gradients.rotations),
+                unused(&gradients.scales),
+                unused(&gradients.opacities),
+                unused(&gradients.colors),
+                scene.uniforms(job),
+                job.options.antialiased,
                 record,
                 wanted,
             );
         }
-        [means, rotations, scales, opacities, colors, background]
+        gradients
     }
 }
 
@@ -182,27 +169,32 @@ fn whole(upstream: Upstream<CubeTensor>, job: &Job, device: &Device<CubeBackend>
     into_contiguous(image)
 }
 
-/// A buffer for a gradient. The shape may be empty; the buffer has at least one number, as kernels require.
-fn gradient<const D: usize>(buffers: &Buffers, shape: [usize; D]) -> CubeTensor {
-    let CubeTensor { client, device, handle, .. } = buffers.empty(shape, DType::F32);
-    CubeTensor::new_contiguous(client, device, Shape::new(shape), handle, DType::F32)
+/// A tensor for the gradient of `input`. Its shape may be empty; the buffer has at least one number, as kernels
+/// require.
+fn like(input: &CubeTensor, buffers: &Buffers) -> CubeTensor {
+    let shape = input.shape();
+    let CubeTensor { client, device, handle, .. } = buffers.f32(shape.num_elements());
+    CubeTensor::new_contiguous(client, device, shape, handle, DType::F32)
 }
 
-/// Contiguous inputs and the number of Gaussians.
-struct Inputs {
-    means: CubeTensor,
-    rotations: CubeTensor,
-    scales: CubeTensor,
-    opacities: CubeTensor,
-    colors: CubeTensor,
-    background: CubeTensor,
+/// Contiguous inputs, and the number of Gaussians. Without Gaussians each buffer has one number, which is not read.
+struct Scene {
+    inputs: Inputs<CubeTensor>,
     len: usize,
 }
 
-impl Inputs {
+impl Scene {
+    fn of(inputs: &Inputs<CubeTensor>, buffers: &Buffers) -> Self {
+        let len = inputs.opacities.meta.num_elements();
+        let contiguous = |tensor: &CubeTensor| {
+            if len == 0 { buffers.f32(1) } else { into_contiguous(tensor.clone()) }
+        };
+        Self { inputs: inputs.as_ref().map(contiguous), len }
+    }
+
     fn parameters(&self) -> ParametersLaunch {
         let buffer = |tensor: &CubeTensor| tensor.clone().into_buffer_arg();
-        let Self { means, rotations, scales, opacities, .. } = self;
+        let Inputs { means, rotations, scales, opacities, .. } = &self.inputs;
         ParametersLaunch::new(buffer(means), buffer(rotations), buffer(scales), buffer(opacities))
     }
 
@@ -213,32 +205,15 @@ impl Inputs {
     }
 }
 
-fn contiguous(inputs: &SplatInputs<CubeBackend>) -> Inputs {
-    let len = inputs.opacities.meta.num_elements();
-    let buffers = Buffers::of(&inputs.means);
-    let contiguous = |tensor: &CubeTensor| {
-        if len == 0 { buffers.f32(1) } else { into_contiguous(tensor.clone()) }
-    };
-    Inputs {
-        means: contiguous(&inputs.means),
-        rotations: contiguous(&inputs.rotations),
-        scales: contiguous(&inputs.scales),
-        opacities: contiguous(&inputs.opacities),
-        colors: contiguous(&inputs.colors),
-        background: into_contiguous(inputs.background.clone()),
-        len,
-    }
-}
-
 /// Steps 1 to 3: splats, their reach, the tiles' lists, and the counts.
 fn lists(
     buffers: &Buffers,
-    inputs: &Inputs,
+    scene: &Scene,
     views: &CubeTensor,
     job: &Job,
     keep: bool,
 ) -> Result<(CubeTensor, CubeTensor, Lists, Counts), SplatError> {
-    let (n, tiles) = (inputs.len, job.tiles_x() * job.tiles_y());
+    let (n, tiles) = (scene.len, job.tiles_x() * job.tiles_y());
     let total = n * job.views.len();
     let all_tiles = tiles * job.views.len();
     let dim = CubeDim::new_1d(UNITS);
@@ -263,15 +238,15 @@ fn lists(
         &buffers.client,
         one_each(total),
         dim,
-        inputs.parameters(),
-        inputs.colors.clone().into_buffer_arg(),
+        scene.parameters(),
+        scene.inputs.colors.clone().into_buffer_arg(),
         views.clone().into_buffer_arg(),
         splats.clone().into_buffer_arg(),
         reach.clone().into_buffer_arg(),
         keys.clone().into_buffer_arg(),
         statistics.clone().into_buffer_arg(),
-        inputs.uniforms(job),
-        job.antialiased,
+        scene.uniforms(job),
+        job.options.antialiased,
     );
     let (_, order) = sort::sort_pairs(buffers, keys, None, total, u32::BITS);
     let sorted = buffers.u32(total);
@@ -288,7 +263,7 @@ fn lists(
     let s: Vec<u32> = into_data_sync(statistics).try_into_vec().expect("u32 as allocated");
     let [low, middle, high] = [0, 1, 2].map(|limb| u64::from(s[FATES + limb]));
     let found = low + (middle << 10) + (high << 20);
-    let limit = limit.min(job.max_intersections.saturating_mul(job.views.len() as u64));
+    let limit = limit.min(job.options.max_intersections.saturating_mul(job.views.len() as u64));
     if found > limit {
         return Err(SplatError::TooManyIntersections { found, limit });
     }
@@ -311,7 +286,7 @@ fn lists(
         reach.clone().into_buffer_arg(),
         tile_of.clone().into_buffer_arg(),
         splat_of.clone().into_buffer_arg(),
-        inputs.uniforms(job),
+        scene.uniforms(job),
     );
     let bits = usize::BITS - all_tiles.leading_zeros();
     let (sorted_tiles, slots) = sort::sort_pairs(buffers, tile_of, None, len, bits);
@@ -333,7 +308,7 @@ fn lists(
 /// The records of all intersections.
 fn records(
     buffers: &Buffers,
-    inputs: &Inputs,
+    scene: &Scene,
     job: &Job,
     state: &State,
     upstream: CubeTensor,
@@ -346,47 +321,16 @@ fn records(
         buffers.cubes(all_tiles),
         CubeDim::new_1d(blend::UNITS as u32),
         state.splats.clone().into_buffer_arg(),
-        inputs.colors.clone().into_buffer_arg(),
-        inputs.background.clone().into_buffer_arg(),
+        scene.inputs.colors.clone().into_buffer_arg(),
         state.lists.launch(),
         state.lists.slots.clone().into_buffer_arg(),
         state.transmittance.clone().into_buffer_arg(),
         state.last.clone().into_buffer_arg(),
         upstream.into_buffer_arg(),
         records.clone().into_buffer_arg(),
-        inputs.uniforms(job),
-        job.depth,
+        scene.uniforms(job),
+        job.options.depth,
         record,
     );
     records
-}
-
-fn background(
-    buffers: &Buffers,
-    inputs: &Inputs,
-    job: &Job,
-    state: &State,
-    upstream: &CubeTensor,
-) -> CubeTensor {
-    let count = job.views.len() * job.height;
-    let (rows, out) = (buffers.f32(3 * count), buffers.f32(3));
-    backward::background_rows::launch(
-        &buffers.client,
-        buffers.cubes(count.div_ceil(UNITS as usize)),
-        CubeDim::new_1d(UNITS),
-        state.transmittance.clone().into_buffer_arg(),
-        upstream.clone().into_buffer_arg(),
-        rows.clone().into_buffer_arg(),
-        inputs.uniforms(job),
-        job.depth,
-    );
-    backward::background_sum::launch(
-        &buffers.client,
-        buffers.cubes(1),
-        CubeDim::new_1d(32),
-        rows.into_buffer_arg(),
-        out.clone().into_buffer_arg(),
-        count,
-    );
-    out
 }

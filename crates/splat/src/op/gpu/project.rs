@@ -6,7 +6,7 @@ use crate::linear::{Mat3, load3};
 use crate::op::splat::{
     Extent, FATES, Gaussian, Splat, Uniforms, VISIBLE, gaussian, splat, tiles_in_row, tiles_of,
 };
-use crate::vjp::View;
+use crate::projection::View;
 
 /// f32 of a camera in a buffer.
 const VIEW: usize = size_of::<View>() / 4;

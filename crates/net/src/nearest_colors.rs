@@ -1,0 +1,128 @@
+//! Colours of the unseen sides: every side point takes the colour of the nearest front or back point
+//! (docs/method.md, "Side colours").
+
+use std::num::NonZeroUsize;
+
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+
+/// Value of a side pixel without a point.
+pub(crate) const EMPTY: f32 = -1.0;
+/// Distance in metres up to which the exact nearest neighbour is found. A k-d tree visits most of its points for a
+/// query that is far from all of them, so that farther queries use a thinned cloud.
+const NEAR: f32 = 0.05;
+/// Least number of points in a thinned cloud.
+const THINNED: usize = 20_000;
+
+/// Coloured points for nearest-neighbour search.
+struct Cloud {
+    tree: ImmutableKdTree<f32, 3>,
+    colors: Vec<[f32; 3]>,
+    /// Every `step`-th point, for queries farther than [`NEAR`].
+    thinned: ImmutableKdTree<f32, 3>,
+    step: usize,
+}
+
+impl Cloud {
+    /// A cloud of points (metres) with colours. Points that are not finite are left out.
+    ///
+    /// `None` if no finite point is left.
+    fn new(points: impl Iterator<Item = ([f32; 3], [f32; 3])>) -> Option<Self> {
+        let (points, colors): (Vec<[f32; 3]>, Vec<_>) = points.filter(|(p, _)| is_finite(p)).unzip();
+        if points.is_empty() {
+            return None;
+        }
+        let step = (points.len() / THINNED).max(1);
+        let some = points.iter().copied().step_by(step).collect::<Vec<_>>();
+        let [tree, thinned] = [points, some].map(|points| {
+            ImmutableKdTree::new_from_slice(&points).expect("fewer points than u32 can number")
+        });
+        Some(Self { tree, colors, thinned, step })
+    }
+
+    /// Colour of the nearest neighbour of each point (metres), on all cores; [`EMPTY`] for points that are not finite.
+    fn nearest_colors(&self, points: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        let mut colors = vec![[EMPTY; 3]; points.len()];
+        let mut left: Vec<usize> = (0..points.len()).filter(|i| is_finite(&points[*i])).collect();
+        for (tree, distance, step) in [(&self.tree, NEAR, 1), (&self.thinned, f32::INFINITY, self.step)] {
+            let queries: Vec<[f32; 3]> = left.iter().map(|i| points[*i]).collect();
+            let found = tree.query_batch(&queries).nearest_n::<SquaredEuclidean<f32>>(NonZeroUsize::MIN);
+            let found = found.within(distance * distance).execute();
+            let mut nearest = found.iter().map(|found| found.first());
+            left.retain(|i| match nearest.next().flatten() {
+                Some(found) => {
+                    colors[*i] = self.colors[step * found.item as usize];
+                    false
+                }
+                None => true,
+            });
+        }
+        colors
+    }
+}
+
+/// Pseudo images of the sides' maps `[3, S, S]`: every valid pixel has the colour of the nearest valid point of the
+/// photographs `[3, S, S]`. `points` `[V, S, S, 3]` are the points of all views.
+pub fn side_images(photos: [&[f32]; 2], points: &[f32], valid: &[Vec<bool>]) -> Vec<Vec<f32>> {
+    let area = valid[0].len();
+    let points = points.as_chunks::<3>().0;
+    let point = |view: usize, i: usize| -> [f32; 3] { points[view * area + i] };
+    let seen = (0..2).flat_map(|view| {
+        let (photo, mask) = (photos[view], &valid[view]);
+        let color = move |i: usize| [photo[i], photo[area + i], photo[2 * area + i]];
+        (0..area).filter(|&i| mask[i]).map(move |i| (point(view, i), color(i)))
+    });
+    let cloud = Cloud::new(seen);
+    (2..valid.len()).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view])).collect()
+}
+
+fn paint(cloud: Option<&Cloud>, point: impl Fn(usize) -> [f32; 3], valid: &[bool]) -> Vec<f32> {
+    let area = valid.len();
+    let mut image = vec![EMPTY; 3 * area];
+    let Some(cloud) = cloud else { return image };
+    let pixels: Vec<usize> = (0..area).filter(|&i| valid[i]).collect();
+    let points: Vec<[f32; 3]> = pixels.iter().map(|&i| point(i)).collect();
+    for (&i, color) in pixels.iter().zip(cloud.nearest_colors(&points)) {
+        for (channel, value) in color.into_iter().enumerate() {
+            image[channel * area + i] = value;
+        }
+    }
+    image
+}
+
+/// Whether all three coordinates are finite.
+pub(crate) fn is_finite(p: &[f32; 3]) -> bool {
+    p.iter().all(|v| v.is_finite())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colours_come_from_the_nearest_point() {
+        let points = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 3.0, 0.0]];
+        let cloud = Cloud::new(points.into_iter().zip([[0.1; 3], [0.2; 3], [0.3; 3]])).expect("points");
+        let queries = [[0.0, 2.99, 0.0], [0.0, 9.0, 0.0], [-0.6, 0.2, 0.0], [7.0, 0.0, 0.0]];
+        assert_eq!(cloud.nearest_colors(&queries), [[0.3; 3], [0.3; 3], [0.2; 3], [0.1; 3]]);
+    }
+
+    /// The points of a line, each with its place as its colour.
+    #[test]
+    fn far_points_have_a_neighbour_near_the_nearest() {
+        let line = (0..100_000).map(|i| i as f32 * 1e-5);
+        let cloud = Cloud::new(line.map(|x| ([x, 0.0, 0.0], [x; 3]))).expect("points");
+        let found = cloud.nearest_colors(&[[0.30001, 0.04, 0.0], [0.30001, 0.2, 0.0]]);
+        assert!((found[0][0] - 0.30001).abs() < 1e-6 && (found[1][0] - 0.30001).abs() <= 5e-5, "{found:?}");
+    }
+
+    #[test]
+    fn identical_and_non_finite_points_do_no_harm() {
+        let same = std::iter::repeat_n(([1.0, 2.0, 3.0], [0.5; 3]), 5000);
+        let bad = [([f32::NAN, 0.0, 0.0], [0.0; 3]), ([f32::INFINITY; 3], [0.0; 3])];
+        let cloud = Cloud::new(bad.into_iter().chain(same)).expect("points");
+        assert_eq!(cloud.colors.len(), 5000);
+        let queries = [[1.0, 2.0, 3.1], [1e15; 3], [f32::NAN; 3], [f32::NEG_INFINITY; 3]];
+        assert_eq!(cloud.nearest_colors(&queries), [[0.5; 3], [0.5; 3], [EMPTY; 3], [EMPTY; 3]]);
+        assert!(Cloud::new(bad.into_iter()).is_none());
+    }
+}

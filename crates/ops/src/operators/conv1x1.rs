@@ -1,0 +1,154 @@
+//! 1×1 convolutions: one matrix product per block of pixels, on images `[B, C, H, W]`. A block is so small that its
+//! channels stay in the second-level cache between the products that read them.
+
+use rayon::prelude::*;
+
+use super::elements::{add_constant, mask, rectify, total};
+use super::{Gradients, Layer, Wanted, join};
+use crate::buffers::{Floats, take};
+use crate::multiply::{Multiply, Right};
+use crate::winograd::pieces;
+
+/// Floats of a block's inputs and outputs: 128 KiB.
+const BLOCK_FLOATS: usize = 32 * 1024;
+/// Largest number of partial sums of the weight's gradient, which are then added in a fixed order.
+const PARTS: usize = 16;
+
+/// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
+#[derive(Debug, Clone, Copy)]
+pub struct Conv1x1 {
+    /// Images.
+    pub batch: usize,
+    /// Channels of the input.
+    pub inputs: usize,
+    /// Channels of the output.
+    pub outputs: usize,
+    /// Height times width.
+    pub pixels: usize,
+    /// Reads max(x, 0).
+    pub rectified: bool,
+    /// Products in bf16, if the processor has the instructions.
+    pub half: bool,
+}
+
+/// Some pixels of one image, and the slices for their results, channel by channel.
+struct Block<'a> {
+    image: usize,
+    first: usize,
+    count: usize,
+    out: Vec<&'a mut [f32]>,
+}
+
+impl Layer for Conv1x1 {
+    type Kept = ();
+
+    /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs]`, `bias` `[outputs]` → `[B, outputs, H, W]`.
+    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
+        let Self { inputs, outputs, pixels, .. } = *self;
+        let mut out = take(self.batch * outputs * pixels);
+        self.blocks(Some((&mut out, outputs))).into_par_iter().for_each(|block| {
+            let (n, x) = (block.count, &x[block.image * inputs * pixels + block.first..]);
+            let mut read = Floats::new(if self.rectified { inputs * n } else { 0 });
+            let mut results = Floats::new(outputs * n);
+            let x = Right::new(self.half, [inputs, n], self.read(x, n, &mut read));
+            Multiply { size: [outputs, n, inputs], lhs: (weight, [1, inputs]), rhs: &x, add: false }
+                .write(&mut results, n);
+            for (c, (out, results)) in block.out.into_iter().zip(results.chunks_exact(n)).enumerate() {
+                let bias = bias.map_or(0.0, |bias| bias[c]);
+                add_constant(results, bias, out);
+            }
+        });
+        (out, ())
+    }
+
+    /// Gradients from the output's gradient `dy` `[B, outputs, H, W]`.
+    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
+        let Self { inputs, outputs, .. } = *self;
+        let mut dx = wanted.input.then(|| take(x.len()));
+        let mut blocks = self.blocks(dx.as_deref_mut().map(|dx| (dx, inputs)));
+        let size = blocks.len().div_ceil(PARTS);
+        let parts: Vec<_> =
+            blocks.par_chunks_mut(size).map(|part| self.part(part, x, weight, dy, wanted)).collect();
+        Gradients {
+            input: dx,
+            weight: wanted
+                .weight
+                .then(|| join(parts.iter().map(|(weights, _)| &weights[..]), outputs * inputs)),
+            bias: wanted.bias.then(|| join(parts.iter().map(|(_, biases)| &biases[..]), outputs)),
+        }
+    }
+}
+
+impl Conv1x1 {
+    /// The gradients of some blocks. Returns the weight's and the bias's gradients, empty if unwanted.
+    fn part(
+        &self,
+        part: &mut [Block],
+        x: &[f32],
+        weight: &[f32],
+        dy: &[f32],
+        wanted: Wanted,
+    ) -> (Vec<f32>, Vec<f32>) {
+        let Self { inputs, outputs, pixels, rectified, .. } = *self;
+        let mut weights = vec![0.0; if wanted.weight { outputs * inputs } else { 0 }];
+        let mut biases = vec![0.0; if wanted.bias { outputs } else { 0 }];
+        let mut add = false;
+        for Block { image, first, count: n, out } in part {
+            let (n, x) = (*n, &x[*image * inputs * pixels..][..inputs * pixels]);
+            let dy = &dy[*image * outputs * pixels..][..outputs * pixels];
+            if wanted.weight {
+                let mut read = Floats::new(if rectified { inputs * n } else { 0 });
+                let (x, [_, stride]) = self.read(&x[*first..], n, &mut read);
+                let (lhs, rhs) = ((&dy[*first..], [1, pixels]), Right::Plain((x, [stride, 1])));
+                Multiply { size: [outputs, inputs, n], lhs, rhs: &rhs, add }.write(&mut weights, inputs);
+                add = true;
+            }
+            if wanted.bias {
+                for (bias, dy) in biases.iter_mut().zip(dy.chunks_exact(pixels)) {
+                    *bias += total(&dy[*first..][..n]);
+                }
+            }
+            if wanted.input {
+                let mut results = Floats::new(inputs * n);
+                let rhs = &Right::Plain((&dy[*first..], [1, pixels]));
+                Multiply { size: [inputs, n, outputs], lhs: (weight, [inputs, 1]), rhs, add: false }
+                    .write(&mut results, n);
+                let channels = out.iter_mut().zip(results.chunks_exact(n)).zip(x.chunks_exact(pixels));
+                for ((out, results), x) in channels {
+                    out.copy_from_slice(results);
+                    if rectified {
+                        mask(&x[*first..][..n], out);
+                    }
+                }
+            }
+        }
+        (weights, biases)
+    }
+
+    /// The first `n` pixels of the (rectified) input: values and their (column, row) strides.
+    fn read<'a>(&self, x: &'a [f32], n: usize, read: &'a mut [f32]) -> (&'a [f32], [usize; 2]) {
+        if !self.rectified {
+            return (x, [1, self.pixels]);
+        }
+        for (read, x) in read.chunks_exact_mut(n).zip(x.chunks(self.pixels)) {
+            rectify(&x[..n], read);
+        }
+        (read, [1, n])
+    }
+
+    /// All blocks, with their slices of `out` `[B, channels, H, W]`, if there is an output.
+    fn blocks<'a>(&self, out: Option<(&'a mut [f32], usize)>) -> Vec<Block<'a>> {
+        let Self { batch, pixels, .. } = *self;
+        let piece = (BLOCK_FLOATS / (self.inputs + self.outputs)).next_multiple_of(64).min(pixels);
+        let mut blocks: Vec<_> = (0..batch)
+            .flat_map(|image| (0..pixels).step_by(piece).map(move |first| (image, first)))
+            .map(|(image, first)| Block { image, first, count: piece.min(pixels - first), out: Vec::new() })
+            .collect();
+        if let Some((out, channels)) = out {
+            let slices =
+                out.chunks_exact_mut(channels * pixels).flat_map(|image| pieces(image, pixels, piece));
+            blocks.iter_mut().zip(slices).for_each(|(block, slices)| block.out = slices);
+        }
+        blocks
+    }
+}

@@ -1,0 +1,164 @@
+//! Linear layers, alone or followed by GELU: one matrix product per block of rows. Bias, GELU and their gradients are
+//! computed while the block is in the cache.
+
+use pulp::Arch;
+use rayon::prelude::*;
+
+use super::elements::{add_rows, add_to_rows};
+use super::{Gradients, Layer, Wanted, join, parts};
+use crate::buffers::{Floats, take};
+use crate::math::{gelu, gelu_derivative};
+use crate::multiply::{Multiply, Right};
+
+/// Rows per task of the products over rows.
+const ROWS: usize = 128;
+/// Least and largest number of rows of the weight's gradient per task. Each task reads all of one factor.
+const WEIGHT_ROWS: [usize; 2] = [48, 256];
+/// Number of tasks of the weight's gradient, within the limits of [`WEIGHT_ROWS`].
+const WEIGHT_TASKS: usize = 16;
+
+/// Sizes of a layer.
+#[derive(Debug, Clone, Copy)]
+pub struct Linear {
+    /// Rows of input and output: tokens of all samples.
+    pub rows: usize,
+    /// Channels of the input.
+    pub inputs: usize,
+    /// Channels of the output.
+    pub outputs: usize,
+    /// The weight is `[outputs, inputs]`, as in a convolution, instead of `[inputs, outputs]`.
+    pub transposed: bool,
+    /// Products in bf16, if the processor has the instructions.
+    pub half: bool,
+    /// GELU (erf form) follows.
+    pub gelu: bool,
+}
+
+impl Layer for Linear {
+    /// The values before GELU `[rows, outputs]`, if kept.
+    type Kept = Option<Floats>;
+
+    /// x · weight + bias, then GELU if the layer has it: `x` `[rows, inputs]` → `[rows, outputs]`.
+    fn forward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        bias: Option<&[f32]>,
+        keep: bool,
+    ) -> (Vec<f32>, Option<Floats>) {
+        let (size, piece) = (self.rows * self.outputs, ROWS * self.outputs);
+        let (mut out, mut before) = (take(size), (self.gelu && keep).then(|| Floats::new(size)));
+        let (arch, weight) = (Arch::new(), self.factor(weight));
+        let kept = parts(before.as_deref_mut(), piece, self.rows.div_ceil(ROWS));
+        let tasks = out.par_chunks_mut(piece).zip(x.par_chunks(ROWS * self.inputs));
+        tasks.zip(kept).for_each(|((out, x), before)| match before {
+            Some(before) => {
+                self.product(x, &weight, bias, before);
+                arch.dispatch(
+                    #[inline(always)]
+                    || out.iter_mut().zip(before).for_each(|(out, z)| *out = gelu(*z)),
+                );
+            }
+            None => {
+                self.product(x, &weight, bias, out);
+                if self.gelu {
+                    arch.dispatch(
+                        #[inline(always)]
+                        || out.iter_mut().for_each(|out| *out = gelu(*out)),
+                    );
+                }
+            }
+        });
+        (out, before)
+    }
+
+    /// Gradients from the output's gradient `dy` `[rows, outputs]`.
+    fn backward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        before: Option<Floats>,
+        dy: &[f32],
+        wanted: Wanted,
+    ) -> Gradients {
+        assert_eq!(before.is_some(), self.gelu, "kept by the forward pass");
+        let Self { rows, inputs, outputs, .. } = *self;
+        let blocks = rows.div_ceil(ROWS);
+        let mut dx = wanted.input.then(|| take(rows * inputs));
+        let mut dz = self.gelu.then(|| Floats::new(rows * outputs));
+        let mut sums = vec![0.0; if wanted.bias { blocks * outputs } else { 0 }];
+        let [column, row] = self.strides();
+        let transposed = wanted.input.then(|| Right::Plain((weight, [row, column])));
+        let results = parts(dx.as_deref_mut(), ROWS * inputs, blocks).into_par_iter();
+        let changed = parts(dz.as_deref_mut(), ROWS * outputs, blocks);
+        let totals = parts(wanted.bias.then_some(&mut sums), outputs, blocks);
+        results.zip(changed).zip(totals).enumerate().for_each(|(i, ((dx, dz), sums))| {
+            let rows = i * ROWS * outputs..((i + 1) * ROWS).min(rows) * outputs;
+            let dy = &dy[rows.clone()];
+            let dz: &[f32] = match (dz, &before) {
+                (Some(dz), Some(before)) => {
+                    derive(&before[rows], dy, dz);
+                    dz
+                }
+                _ => dy,
+            };
+            if let Some(sums) = sums {
+                add_rows(dz, sums);
+            }
+            if let Some((dx, rhs)) = dx.zip(transposed.as_ref()) {
+                let size = [dz.len() / outputs, inputs, outputs];
+                Multiply { size, lhs: (dz, [1, outputs]), rhs, add: false }.write(dx, inputs);
+            }
+        });
+        let weight = wanted.weight.then(|| self.weight_gradient(x, dz.as_deref().unwrap_or(dy)));
+        Gradients { input: dx, weight, bias: wanted.bias.then(|| join(sums.chunks_exact(outputs), outputs)) }
+    }
+}
+
+impl Linear {
+    fn weight_gradient(&self, x: &[f32], dz: &[f32]) -> Vec<f32> {
+        // Rows and columns in the order in which the weight is stored.
+        let (inputs, outputs) = ((x, self.inputs), (dz, self.outputs));
+        let ((left, rows), (right, columns)) =
+            if self.transposed { (outputs, inputs) } else { (inputs, outputs) };
+        let mut out = take(rows * columns);
+        let rhs = &Right::Plain((right, [1, columns]));
+        let block = rows.div_ceil(WEIGHT_TASKS).clamp(WEIGHT_ROWS[0], WEIGHT_ROWS[1]);
+        out.par_chunks_mut(block * columns).enumerate().for_each(|(i, out)| {
+            let size = [out.len() / columns, columns, self.rows];
+            let lhs = (&left[i * block..], [rows, 1]);
+            Multiply { size, lhs, rhs, add: false }.write(out, columns);
+        });
+        out
+    }
+
+    /// (column, row) strides of the weight as `[inputs, outputs]`.
+    fn strides(&self) -> [usize; 2] {
+        if self.transposed { [self.inputs, 1] } else { [1, self.outputs] }
+    }
+
+    /// The weight as the right factor.
+    fn factor<'a>(&self, weight: &'a [f32]) -> Right<'a> {
+        Right::new(self.half, [self.inputs, self.outputs], (weight, self.strides()))
+    }
+
+    fn product(&self, x: &[f32], rhs: &Right, bias: Option<&[f32]>, out: &mut [f32]) {
+        let (size, lhs) = ([x.len() / self.inputs, self.outputs, self.inputs], (x, [1, self.inputs]));
+        Multiply { size, lhs, rhs, add: false }.write(out, self.outputs);
+        if let Some(bias) = bias {
+            add_to_rows(bias, out);
+        }
+    }
+}
+
+/// dz = dy · gelu'(z).
+fn derive(z: &[f32], dy: &[f32], dz: &mut [f32]) {
+    Arch::new().dispatch(
+        #[inline(always)]
+        || {
+            for ((dz, z), dy) in dz.iter_mut().zip(z).zip(dy) {
+                *dz = dy * gelu_derivative(*z);
+            }
+        },
+    );
+}

@@ -1,0 +1,175 @@
+//! Layer normalisation, forward and backward.
+
+use pulp::{Arch, Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::{Gradients, Layer, Wanted, join, parts};
+use crate::buffers::take;
+
+/// Rows per task.
+const ROWS: usize = 64;
+/// Independent accumulators of a sum, as many as the widest vector has lanes.
+const LANES: usize = 16;
+
+/// (x − mean) / √(variance + epsilon) · weight + bias over the channels of every row.
+#[derive(Debug, Clone, Copy)]
+pub struct LayerNorm {
+    /// Channels of a row.
+    pub channels: usize,
+    /// Added to the variance.
+    pub epsilon: f32,
+}
+
+/// Mean and 1 / √(variance + epsilon) of a row.
+type Statistics = [f32; 2];
+
+impl Layer for LayerNorm {
+    type Kept = Vec<Statistics>;
+
+    /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]` and each row's statistics.
+    fn forward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        bias: Option<&[f32]>,
+        _keep: bool,
+    ) -> (Vec<f32>, Vec<Statistics>) {
+        let bias = bias.expect("the published norms have biases");
+        let mut out = take(x.len());
+        let mut statistics = vec![[0.0; 2]; x.len() / self.channels];
+        let (arch, piece) = (Arch::new(), ROWS * self.channels);
+        let tasks = out.par_chunks_mut(piece).zip(x.par_chunks(piece)).zip(statistics.par_chunks_mut(ROWS));
+        tasks.for_each(|((out, x), statistics)| {
+            arch.dispatch(Forward { norm: self, x, weight, bias, out, statistics });
+        });
+        (out, statistics)
+    }
+
+    /// Gradients from the output's gradient `dy` `[rows, channels]`. If the gradient of weight or bias is wanted, both
+    /// are computed.
+    fn backward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        statistics: Vec<Statistics>,
+        dy: &[f32],
+        wanted: Wanted,
+    ) -> Gradients {
+        let (c, piece) = (self.channels, ROWS * self.channels);
+        let (arch, blocks) = (Arch::new(), statistics.len().div_ceil(ROWS));
+        let summed = wanted.weight || wanted.bias;
+        let mut sums = vec![0.0; if summed { 2 * blocks * c } else { 0 }];
+        let mut dx = wanted.input.then(|| take(x.len()));
+        let results = parts(dx.as_deref_mut(), piece, blocks).into_par_iter();
+        let totals = parts(summed.then_some(&mut sums), 2 * c, blocks);
+        let given = x.par_chunks(piece).zip(dy.par_chunks(piece)).zip(statistics.par_chunks(ROWS));
+        results.zip(totals).zip(given).for_each(|((dx, sums), ((x, dy), statistics))| {
+            if let Some(sums) = sums {
+                let (weight, bias) = sums.split_at_mut(c);
+                arch.dispatch(ColumnSums { x, dy, statistics, weight, bias });
+            }
+            if let Some(dx) = dx {
+                arch.dispatch(Backward { x, dy, weight, statistics, dx });
+            }
+        });
+        let mut joined = join(sums.chunks_exact(2 * c), 2 * c);
+        let bias = wanted.bias.then(|| joined.split_off(c));
+        joined.truncate(c);
+        Gradients { input: dx, weight: wanted.weight.then_some(joined), bias }
+    }
+}
+
+/// The sum of f over all positions of the slices, as sixteen interleaved sums.
+#[inline(always)]
+fn sum<const N: usize>(slices: [&[f32]; N], f: impl Fn([f32; N]) -> f32) -> f32 {
+    let whole = slices[0].len() / LANES * LANES;
+    let mut sums = [0.0; LANES];
+    let chunks = slices.map(|slice| slice.as_chunks::<LANES>().0);
+    for i in 0..whole / LANES {
+        let chunk = chunks.map(|chunks| &chunks[i]);
+        for lane in 0..LANES {
+            sums[lane] += f(chunk.map(|chunk| chunk[lane]));
+        }
+    }
+    let rest = (whole..slices[0].len()).map(|i| f(slices.map(|slice| slice[i])));
+    sums.into_iter().sum::<f32>() + rest.sum::<f32>()
+}
+
+struct Forward<'a> {
+    norm: &'a LayerNorm,
+    x: &'a [f32],
+    weight: &'a [f32],
+    bias: &'a [f32],
+    out: &'a mut [f32],
+    statistics: &'a mut [Statistics],
+}
+
+impl WithSimd for Forward<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let c = self.norm.channels;
+        let rows = self.x.chunks_exact(c).zip(self.out.chunks_exact_mut(c)).zip(self.statistics);
+        for ((x, out), statistics) in rows {
+            let mean = sum([x], |[x]| x) / c as f32;
+            let variance = sum([x], |[x]| (x - mean) * (x - mean)) / c as f32;
+            let scale = 1.0 / (variance + self.norm.epsilon).sqrt();
+            *statistics = [mean, scale];
+            for (((out, x), w), b) in out.iter_mut().zip(x).zip(self.weight).zip(self.bias) {
+                *out = (x - mean) * scale * w + b;
+            }
+        }
+    }
+}
+
+/// dx = scale · (g − mean(g) − h · mean(g·h)), with the normalised row h and g = dy·weight.
+struct Backward<'a> {
+    x: &'a [f32],
+    dy: &'a [f32],
+    weight: &'a [f32],
+    statistics: &'a [Statistics],
+    dx: &'a mut [f32],
+}
+
+impl WithSimd for Backward<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let c = self.weight.len();
+        let rows = self.x.chunks_exact(c).zip(self.dy.chunks_exact(c)).zip(self.dx.chunks_exact_mut(c));
+        for (((x, dy), dx), &[mean, scale]) in rows.zip(self.statistics) {
+            let constant = sum([dy, self.weight], |[dy, w]| dy * w) / c as f32;
+            let slope = sum([dy, self.weight, x], |[dy, w, x]| dy * w * ((x - mean) * scale)) / c as f32;
+            for (((dx, x), dy), w) in dx.iter_mut().zip(x).zip(dy).zip(self.weight) {
+                *dx = (dy * w - constant - (x - mean) * scale * slope) * scale;
+            }
+        }
+    }
+}
+
+/// Column sums of dy·h (`weight`) and dy (`bias`), with the normalised row h.
+struct ColumnSums<'a> {
+    x: &'a [f32],
+    dy: &'a [f32],
+    statistics: &'a [Statistics],
+    weight: &'a mut [f32],
+    bias: &'a mut [f32],
+}
+
+impl WithSimd for ColumnSums<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _simd: S) {
+        let c = self.weight.len();
+        let rows = self.x.chunks_exact(c).zip(self.dy.chunks_exact(c)).zip(self.statistics);
+        for ((x, dy), &[mean, scale]) in rows {
+            for (((weight, bias), x), dy) in self.weight.iter_mut().zip(&mut *self.bias).zip(x).zip(dy) {
+                *weight += dy * ((x - mean) * scale);
+                *bias += dy;
+            }
+        }
+    }
+}

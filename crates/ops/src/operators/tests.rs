@@ -1,0 +1,296 @@
+//! The operators against Burn's in f64, forward and backward, with channels that fill no group, tiles and blocks that
+//! overhang, and single rows.
+
+use super::*;
+use crate::rotary::plain_attention;
+use crate::testing::{assert_equal, tensor, uniform as random, values, wide};
+use crate::{Rope, bilinear, has_kernels, host, is_bf16, layers, linear_gelu, rotary_attention};
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::nn::conv::{Conv2dConfig, ConvTranspose2dConfig};
+use burn::nn::{LayerNormConfig, LinearConfig, PaddingConfig2d};
+use burn::tensor::{Device, FloatDType, Gradients as Found, Tensor};
+
+/// All gradients.
+const ALL: Wanted = Wanted { input: true, weight: true, bias: true };
+
+/// Replaces all parameters by random values of a float type.
+struct Filled {
+    float: FloatDType,
+    seed: u64,
+}
+
+impl ModuleMapper for Filled {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let (id, values, mapper) = param.consume();
+        self.seed += 1;
+        let values = tensor(values.dims(), self.seed, self.float);
+        Param::from_mapped_value(id, values.require_grad(), mapper)
+    }
+}
+
+/// Collects the gradients of all parameters.
+struct Collect<'a>(&'a Found, Vec<Vec<f64>>);
+
+impl ModuleVisitor for Collect<'_> {
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        self.1.push(values(param.val().grad(self.0).expect("every parameter counts")));
+    }
+}
+
+/// Compares `run` in f32, and in f32 with parameters in bf16, with `run` in f64: the result, and the gradients of the
+/// input and of the module's parameters. Only an input in f32 reaches the operators of this crate.
+fn check<M: Module, const A: usize, const D: usize>(
+    what: &str,
+    module: M,
+    shape: [usize; A],
+    run: impl Fn(&M, Tensor<A>) -> Tensor<D>,
+) {
+    use FloatDType::{BF16, F32, F64};
+    let [got, half, expected] = [(F32, F32), (BF16, F32), (F64, F64)].map(|(of_module, float)| {
+        let module = module.clone().map(&mut Filled { float: of_module, seed: 10 });
+        let x = tensor(shape, 1, float).require_grad();
+        let y = run(&module, x.clone());
+        let all = (y.clone() * tensor(y.dims(), 2, float)).sum().backward();
+        let of_input = values(x.grad(&all).expect("tracked"));
+        let mut collect = Collect(&all, vec![values(y), of_input]);
+        module.visit(&mut collect);
+        collect.1
+    });
+    for (i, ((got, half), expected)) in got.iter().zip(&half).zip(&expected).enumerate() {
+        assert_equal(&format!("{what}, tensor {i}"), got, expected);
+        assert_close(&format!("{what}, tensor {i} in bf16"), half, expected);
+    }
+}
+
+/// Bounds the relative L2 error and the cosine in bf16, whose rounding is 2⁻⁹ at most.
+fn assert_close(what: &str, got: &[f64], expected: &[f64]) {
+    assert_eq!(got.len(), expected.len(), "{what}");
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let (one, other) = (dot(got, got), dot(expected, expected));
+    let difference: Vec<f64> = got.iter().zip(expected).map(|(got, expected)| got - expected).collect();
+    let error = (dot(&difference, &difference) / other.max(1e-30)).sqrt();
+    let cosine = if one + other > 0.0 { dot(got, expected) / (one * other).sqrt() } else { 1.0 };
+    println!("{what}: {error:e}, cosine {cosine}");
+    assert!(error < 1e-2 && cosine > 0.9999, "{what}: {error:e}, cosine {cosine}");
+}
+
+#[test]
+fn convolutions_of_three_taps_equal_burns() {
+    let sizes = [
+        [1, 1, 1, 1, 1],
+        [2, 5, 7, 2, 3],
+        [1, 16, 48, 9, 13],
+        [3, 33, 17, 1, 21],
+        [1, 3, 2, 5, 700],
+        [2, 20, 40, 18, 33],
+        [3, 5, 18, 19, 21],
+    ];
+    for ([batch, inputs, outputs, height, width], stride) in
+        sizes.into_iter().flat_map(|size| [1, 2].map(|stride| (size, stride)))
+    {
+        let padding = PaddingConfig2d::Explicit(1, 1, 1, 1);
+        let layer =
+            Conv2dConfig::new([inputs, outputs], [3, 3]).with_stride([stride; 2]).with_padding(padding);
+        for rectified in [false, true] {
+            let what =
+                format!("{batch}×{inputs}→{outputs} at {height}×{width}, stride {stride}, {rectified}");
+            let layer = layer.init(&Device::flex().autodiff());
+            check(&what, layer, [batch, inputs, height, width], |l, x| layers::conv2d(l, x, rectified));
+        }
+    }
+}
+
+#[test]
+fn taps_that_see_nothing_have_no_gradient() {
+    let conv = Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true };
+    let mut x = vec![-1.0; 1024];
+    x[0] = 0.7;
+    let mut dy = vec![0.0; 1024];
+    dy[0] = 0.3;
+    let gradients = conv.backward(&x, &[0.1; 9], (), &dy, ALL);
+    let expected: Vec<f32> = (0..9).map(|tap| if tap == 4 { 0.7 * 0.3 } else { 0.0 }).collect();
+    assert_eq!(gradients.weight, Some(expected));
+}
+
+#[test]
+fn convolutions_of_one_tap_equal_burns() {
+    for [batch, inputs, outputs, height, width] in
+        [[1, 1, 1, 1, 1], [2, 35, 4, 9, 7], [3, 20, 40, 1, 300], [1, 4, 3, 130, 90]]
+    {
+        for rectified in [false, true] {
+            let layer = Conv2dConfig::new([inputs, outputs], [1, 1]).init(&Device::flex().autodiff());
+            let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}, {rectified}");
+            check(&what, layer, [batch, inputs, height, width], |l, x| layers::conv2d(l, x, rectified));
+        }
+    }
+}
+
+#[test]
+fn transposed_convolutions_equal_burns() {
+    for (stride, [batch, inputs, outputs, height, width]) in
+        [(2, [2, 18, 35, 3, 5]), (4, [1, 16, 8, 4, 4]), (3, [3, 1, 1, 1, 2]), (2, [1, 40, 70, 30, 9])]
+    {
+        let layer = ConvTranspose2dConfig::new([inputs, outputs], [stride; 2]).with_stride([stride; 2]);
+        let layer = layer.init(&Device::flex().autodiff());
+        let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}, {stride} times as large");
+        check(&what, layer, [batch, inputs, height, width], layers::enlarge);
+    }
+}
+
+#[test]
+fn patch_embeddings_equal_burns() {
+    for [batch, inputs, outputs, height, width, side] in
+        [[2, 3, 19, 6, 4, 2], [1, 8, 5, 3, 12, 3], [3, 1, 1, 16, 16, 16]]
+    {
+        let layer = Conv2dConfig::new([inputs, outputs], [side; 2]).with_stride([side; 2]);
+        let layer = layer.with_padding(PaddingConfig2d::Valid).init(&Device::flex().autodiff());
+        check(&format!("patches of {side}"), layer, [batch, inputs, height, width], layers::patches);
+    }
+}
+
+#[test]
+fn linear_layers_equal_burns() {
+    for [rows, inputs, outputs] in [[1, 1, 16], [7, 20, 37], [131, 9, 70], [300, 5, 3]] {
+        let layer = LinearConfig::new(inputs, outputs).init(&Device::flex().autodiff());
+        let (what, shape) = (format!("{rows}×{inputs}→{outputs}"), [1, rows, inputs]);
+        check(&what, layer.clone(), shape, layers::linear);
+        check(&format!("{what}, GELU"), layer, shape, linear_gelu);
+    }
+}
+
+#[test]
+fn layer_norm_equals_burns() {
+    for [rows, channels] in [[1, 3], [130, 37], [3, 192]] {
+        let layer = LayerNormConfig::new(channels).with_epsilon(1e-6).init(&Device::flex().autodiff());
+        let norm = |l: &_, x| layers::layer_norm(l, 1e-6, x);
+        check(&format!("{rows}×{channels}"), layer, [1, rows, channels], norm);
+    }
+}
+
+/// Keys and values as parameters, so that `check` compares their gradients.
+#[derive(Module, Debug)]
+struct Pairs {
+    keys: Param<Tensor<3>>,
+    values: Param<Tensor<3>>,
+}
+
+#[test]
+fn rotary_attention_equals_burns() {
+    let device = Device::flex().autodiff();
+    for [batch, queries, keys, heads, head_dim] in [[1, 1, 1, 1, 4], [2, 5, 5, 3, 8], [1, 70, 66, 2, 4]] {
+        let c = heads * head_dim;
+        let zeros = || Param::from_tensor(Tensor::zeros([batch, keys, c], &device));
+        let ropes = [queries, keys].map(|n: usize| {
+            let Rope { cos, sin } = Rope::new(n.div_ceil(4), 4, head_dim, 100.0, &device);
+            Rope { cos: cos.narrow(0, 0, n), sin: sin.narrow(0, 0, n) }
+        });
+        let run = |pairs: &Pairs, q: Tensor<3>| {
+            let (k, v) = (pairs.keys.val(), pairs.values.val());
+            if has_kernels(&q) {
+                let half = is_bf16(&pairs.keys);
+                let [k, v] = [k, v].map(|x| x.cast(FloatDType::F32));
+                return rotary_attention(q, k, v, &ropes[0], heads, half);
+            }
+            let [rope_q, rope_k] = ropes.clone().map(|Rope { cos, sin }| Rope {
+                cos: cos.cast(FloatDType::F64),
+                sin: sin.cast(FloatDType::F64),
+            });
+            plain_attention(q, k, v, [&rope_q, &rope_k], heads)
+        };
+        let pairs = Pairs { keys: zeros(), values: zeros() };
+        check(&format!("{queries} and {keys} tokens"), pairs, [batch, queries, c], run);
+    }
+}
+
+#[test]
+fn attention_of_parts_equals_that_of_tensors() {
+    let attention = Attention { batch: 2, queries: 67, keys: 67, heads: 2, head_dim: 8, half: false };
+    let (channels, tokens) = (16, 2 * 67);
+    let (qkv, dy) = (random(tokens * 3 * channels, 1), random(tokens * channels, 2));
+    let part = |i: usize| -> Vec<f32> {
+        qkv.chunks_exact(3 * channels).flat_map(|token| &token[i * channels..][..channels]).copied().collect()
+    };
+    let apart = [part(0), part(1), part(2)];
+    let Rope { cos, sin } = Rope::new(1, 67, 8, 100.0, &Device::flex());
+    let (cos, sin) = (host(cos), host(sin));
+    let rope = [&cos[..], &sin];
+    let (parts, tensors) =
+        (Tokens::parts(&qkv, channels), Tokens::apart(apart.each_ref().map(|x| &x[..]), channels));
+    let (result, logarithms) = attention.forward(parts, rope);
+    assert_eq!(result, attention.forward(tensors, rope).0);
+    let joined = attention.backward_parts(parts, rope, &logarithms, &dy);
+    let gradients = attention.backward(tensors, rope, &logarithms, &dy);
+    for (i, got) in joined.chunks_exact(channels).enumerate() {
+        assert_eq!(got, &gradients[i % 3][i / 3 * channels..][..channels]);
+    }
+}
+
+#[test]
+fn resizing_equals_burns() {
+    for (from, to) in [([1, 1], [2, 2]), ([3, 5], [6, 10]), ([9, 2], [4, 7]), ([5, 6], [5, 13])] {
+        for align_corners in [false, true] {
+            let nothing = Vec::<Param<Tensor<1>>>::new();
+            let what = format!("{from:?} → {to:?}, {align_corners}");
+            check(&what, nothing, [1, 3, from[0], from[1]], |_, x| bilinear(x, to, align_corners));
+        }
+    }
+}
+
+/// Results and gradients of all operators, at sizes that need several tasks.
+fn everything(half: bool) -> Vec<Vec<f32>> {
+    fn add<L: Layer>(all: &mut Vec<Vec<f32>>, layer: &L, [x, weight, bias, dy]: [&[f32]; 4]) {
+        let (result, kept) = layer.forward(x, weight, Some(bias), true);
+        assert_eq!(layer.forward(x, weight, Some(bias), false).0, result);
+        let Gradients { input, weight, bias } = layer.backward(x, weight, kept, dy, ALL);
+        all.push(result);
+        all.extend([input, weight, bias].into_iter().flatten());
+    }
+    let mut all = Vec::new();
+    let (x, dy) = (random(2 * 40 * 30 * 50, 1), random(2 * 72 * 30 * 50, 2));
+    let (weight, bias) = (random(72 * 40 * 9, 3), random(72, 4));
+    let [batch, inputs, outputs, height, width] = [2, 40, 72, 30, 50];
+    let given = [&x[..], &weight, &bias, &dy];
+    add(&mut all, &Conv3x3 { batch, inputs, outputs, height, width, rectified: true }, given);
+    let halving = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: true };
+    add(&mut all, &halving, [&x, &weight, &bias, &dy[..2 * 72 * 15 * 25]]);
+    add(&mut all, &Conv1x1 { batch, inputs, outputs, pixels: 1500, rectified: true, half }, given);
+    let linear = Linear { rows: 1500, inputs: 80, outputs, transposed: false, half, gelu: true };
+    add(&mut all, &linear, given);
+    let norm = LayerNorm { channels: 80, epsilon: 1e-6 };
+    add(&mut all, &norm, [&x, &weight[..80], &weight[..80], &dy[..x.len()]]);
+    let attention = Attention { batch, queries: 150, keys: 150, heads: 2, head_dim: 8, half };
+    let tables = [&dy[..150 * 8], &dy[150 * 8..][..150 * 8]];
+    let tokens = Tokens::parts(&x, 16);
+    let (result, logarithms) = attention.forward(tokens, tables);
+    all.push(result);
+    all.push(attention.backward_parts(tokens, tables, &logarithms, &dy[..2 * 150 * 16]));
+    all
+}
+
+#[test]
+fn the_number_of_threads_changes_no_bit() {
+    let run = |threads: usize, half: bool| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+        let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect::<Vec<_>>();
+        pool.install(|| everything(half)).into_iter().map(bits).collect::<Vec<_>>()
+    };
+    for half in [false, true] {
+        assert!(run(1, half) == run(3, half), "{half}");
+    }
+}
+
+#[test]
+fn only_wanted_gradients_are_found_and_they_are_the_same() {
+    let conv = Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false };
+    let (x, weight, dy) = (random(3 * 42, 1), random(135, 2), random(5 * 42, 3));
+    let all = conv.backward(&x, &weight, (), &dy, ALL);
+    for bits in 0..8 {
+        let wanted = Wanted { input: bits & 1 > 0, weight: bits & 2 > 0, bias: bits & 4 > 0 };
+        let got = conv.backward(&x, &weight, (), &dy, wanted);
+        assert_eq!(got.input, all.input.clone().filter(|_| wanted.input));
+        assert_eq!(got.weight, all.weight.clone().filter(|_| wanted.weight));
+        assert_eq!(got.bias.is_some(), wanted.bias);
+        let bias = got.bias.unwrap_or_else(|| all.bias.clone().expect("all are wanted"));
+        assert_equal("bias", &wide(&bias), &wide(all.bias.as_ref().expect("all are wanted")));
+    }
+}

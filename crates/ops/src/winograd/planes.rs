@@ -1,0 +1,310 @@
+//! Conversion between images `[C, H, W]` and the groups of 16 adjacent channels that the transforms read. Blocks of
+//! 16 × 16 values are transposed in registers, so no image is stored a second time.
+
+use super::GROUP;
+
+/// The values of 16 pixels in 16 channels.
+type Square = [[f32; GROUP]; GROUP];
+
+/// The way in which this processor transposes squares.
+#[derive(Debug, Clone, Copy)]
+pub struct Transposer {
+    #[cfg(target_arch = "x86_64")]
+    wide: Option<pulp::x86::V4>,
+}
+
+impl Transposer {
+    pub fn new() -> Self {
+        Self {
+            #[cfg(target_arch = "x86_64")]
+            wide: pulp::x86::V4::try_new(),
+        }
+    }
+
+    /// Runs `op`, compiled for the widest vectors of this processor.
+    #[inline(always)]
+    fn run(self, op: impl WithTranspose) {
+        #[cfg(target_arch = "x86_64")]
+        if let Some(simd) = self.wide {
+            return simd.vectorize(
+                #[inline(always)]
+                || op.run(Wide(simd)),
+            );
+        }
+        op.run(Plain);
+    }
+}
+
+/// Work that needs a transposition.
+trait WithTranspose {
+    fn run(self, transpose: impl Transpose);
+}
+
+/// A way to transpose squares.
+trait Transpose: Copy {
+    fn square(self, square: Square) -> Square;
+}
+
+#[derive(Clone, Copy)]
+struct Plain;
+
+impl Transpose for Plain {
+    fn square(self, square: Square) -> Square {
+        std::array::from_fn(|i| std::array::from_fn(|j| square[j][i]))
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[derive(Clone, Copy)]
+struct Wide(pulp::x86::V4);
+
+#[cfg(target_arch = "x86_64")]
+impl Transpose for Wide {
+    /// Four rounds of shuffles: of values, of pairs of values, of quarters and of halves.
+    ///
+    /// Loops, because closures of `array::from_fn` are not compiled for the target's features.
+    #[inline(always)]
+    fn square(self, square: Square) -> Square {
+        use std::arch::x86_64::{__m512, __m512d};
+        let f = self.0.avx512f;
+        let mut rows: [__m512; GROUP] = pulp::cast(square);
+        for i in (0..GROUP).step_by(2) {
+            let (a, b) = (rows[i], rows[i + 1]);
+            (rows[i], rows[i + 1]) = (f._mm512_unpacklo_ps(a, b), f._mm512_unpackhi_ps(a, b));
+        }
+        // Afterwards quarter q of row 4·i + j holds column 4·q + j of rows 4·i … 4·i + 3.
+        let mut pairs: [__m512d; GROUP] = pulp::cast(rows);
+        for i in (0..GROUP).step_by(4) {
+            let [a, b, c, d] = [pairs[i], pairs[i + 1], pairs[i + 2], pairs[i + 3]];
+            (pairs[i], pairs[i + 1]) = (f._mm512_unpacklo_pd(a, c), f._mm512_unpackhi_pd(a, c));
+            (pairs[i + 2], pairs[i + 3]) = (f._mm512_unpacklo_pd(b, d), f._mm512_unpackhi_pd(b, d));
+        }
+        let mut rows: [__m512; GROUP] = pulp::cast(pairs);
+        for distance in [4, 8] {
+            for i in 0..GROUP {
+                if i & distance == 0 {
+                    let (a, b) = (rows[i], rows[i + distance]);
+                    rows[i] = f._mm512_shuffle_f32x4::<0x88>(a, b);
+                    rows[i + distance] = f._mm512_shuffle_f32x4::<0xdd>(a, b);
+                }
+            }
+        }
+        pulp::cast(rows)
+    }
+}
+
+/// max(x, 0) of every value.
+#[inline(always)]
+fn rectify(square: &mut Square) {
+    for x in square.as_flattened_mut() {
+        *x = if *x > 0.0 { *x } else { 0.0 };
+    }
+}
+
+/// One image `[channels, height, width]`, read in groups of 16 channels.
+#[derive(Debug, Clone, Copy)]
+pub struct Planes<'a> {
+    pub data: &'a [f32],
+    pub height: usize,
+    pub width: usize,
+    /// Reads max(image, 0).
+    pub rectified: bool,
+    pub transposer: Transposer,
+}
+
+impl Planes<'_> {
+    fn channels(&self) -> usize {
+        self.data.len() / (self.height * self.width)
+    }
+
+    /// Groups of channels.
+    pub fn groups(&self) -> usize {
+        self.channels().div_ceil(GROUP)
+    }
+
+    /// Writes a part of a row of one group to `out` `[columns][16]`, from column `first` on, where −1 is the border.
+    /// Pixels outside of the image are 0. `None` is a row outside of the image.
+    pub fn read(&self, group: usize, row: Option<usize>, first: isize, out: &mut [f32]) {
+        let Some(row) = row.filter(|row| *row < self.height) else {
+            out.fill(0.0);
+            return;
+        };
+        let from = first.max(0) as usize;
+        let (border, out) = out.split_at_mut(if first < 0 { GROUP } else { 0 });
+        let (out, beyond) = out.split_at_mut((self.width - from).min(out.len() / GROUP) * GROUP);
+        border.fill(0.0);
+        beyond.fill(0.0);
+        let plane = self.height * self.width;
+        let data = &self.data[group * GROUP * plane + row * self.width + from..];
+        let channels = GROUP.min(self.channels() - group * GROUP);
+        let pixels = out.as_chunks_mut().0;
+        self.transposer.run(Gather { data, plane, channels, rectified: self.rectified, pixels });
+    }
+}
+
+/// Makes the channels of each pixel adjacent, for up to 16 planes that begin `plane` floats apart.
+struct Gather<'a> {
+    data: &'a [f32],
+    plane: usize,
+    channels: usize,
+    rectified: bool,
+    pixels: &'a mut [[f32; GROUP]],
+}
+
+impl WithTranspose for Gather<'_> {
+    #[inline(always)]
+    fn run(self, transpose: impl Transpose) {
+        let Self { data, plane, channels, rectified, pixels } = self;
+        let (squares, rest) = pixels.as_chunks_mut::<GROUP>();
+        let mut done = 0;
+        if channels == GROUP && !squares.is_empty() {
+            // Sixteen load instructions are sixteen streams that the processor prefetches.
+            let mut planes = [data; GROUP];
+            for (c, values) in planes.iter_mut().enumerate() {
+                *values = &data[c * plane..][..squares.len() * GROUP];
+            }
+            for (i, out) in squares.iter_mut().enumerate() {
+                let mut square = [[0.0; GROUP]; GROUP];
+                for c in 0..GROUP {
+                    square[c] = planes[c].as_chunks().0[i];
+                }
+                if rectified {
+                    rectify(&mut square);
+                }
+                *out = transpose.square(square);
+            }
+            done = squares.len();
+        }
+        let ragged = squares.iter_mut().map(<[_; GROUP]>::as_mut_slice).skip(done);
+        for (i, out) in (done..).zip(ragged.chain([rest])) {
+            let mut square = [[0.0; GROUP]; GROUP];
+            for (c, row) in square.iter_mut().enumerate().take(channels) {
+                row[..out.len()].copy_from_slice(&data[c * plane + i * GROUP..][..out.len()]);
+            }
+            if rectified {
+                rectify(&mut square);
+            }
+            out.copy_from_slice(&transpose.square(square)[..out.len()]);
+        }
+    }
+}
+
+/// Writes pixels with adjacent channels to up to 16 planes.
+pub struct Scatter<'a, 'b> {
+    /// `[pixels][16]`.
+    pub pixels: &'a [f32],
+    /// The same pixels of every channel.
+    pub planes: &'a mut [&'b mut [f32]],
+    /// Planes and the number of floats between them. Where they are not positive, 0 is written.
+    pub mask: Option<(&'a [f32], usize)>,
+}
+
+impl Scatter<'_, '_> {
+    pub fn run(self, transposer: Transposer) {
+        transposer.run(self);
+    }
+}
+
+impl WithTranspose for Scatter<'_, '_> {
+    #[inline(always)]
+    fn run(self, transpose: impl Transpose) {
+        let Self { pixels, planes, mask } = self;
+        let (squares, rest) = pixels.as_chunks::<GROUP>().0.as_chunks::<GROUP>();
+        let whole = squares.len() * GROUP;
+        let mut done = 0;
+        if let Ok(planes) = <&mut [&mut [f32]; GROUP]>::try_from(&mut *planes) {
+            let mut out: [&mut [[f32; GROUP]]; GROUP] = Default::default();
+            for (out, plane) in out.iter_mut().zip(planes) {
+                *out = &mut plane.as_chunks_mut().0[..squares.len()];
+            }
+            let mut signs = [&[[1.0; GROUP]][..0]; GROUP];
+            if let Some((mask, stride)) = mask {
+                for (c, signs) in signs.iter_mut().enumerate() {
+                    *signs = mask[c * stride..][..whole].as_chunks().0;
+                }
+            }
+            for (i, square) in squares.iter().enumerate() {
+                let mut square = transpose.square(*square);
+                if mask.is_some() {
+                    let mut given = [[0.0; GROUP]; GROUP];
+                    for c in 0..GROUP {
+                        given[c] = signs[c][i];
+                    }
+                    keep_positive(square.as_flattened_mut(), given.as_flattened());
+                }
+                for c in 0..GROUP {
+                    out[c][i] = square[c];
+                }
+            }
+            done = squares.len();
+        }
+        let ragged = squares.iter().map(<[_; GROUP]>::as_slice).skip(done);
+        for (i, pixels) in (done..).zip(ragged.chain([rest])) {
+            let mut square = [[0.0; GROUP]; GROUP];
+            square[..pixels.len()].copy_from_slice(pixels);
+            let square = transpose.square(square);
+            let at = i * GROUP..i * GROUP + pixels.len();
+            for (c, (plane, mut row)) in planes.iter_mut().zip(square).enumerate() {
+                if let Some((mask, stride)) = mask {
+                    keep_positive(&mut row, &mask[c * stride..][at.clone()]);
+                }
+                plane[at.clone()].copy_from_slice(&row[..pixels.len()]);
+            }
+        }
+    }
+}
+
+/// values = 0 where x is not positive.
+#[inline(always)]
+fn keep_positive(values: &mut [f32], x: &[f32]) {
+    for (value, x) in values.iter_mut().zip(x) {
+        *value = if *x > 0.0 { *value } else { 0.0 };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 35 channels of 7 × 21 pixels to groups and back, with this processor's transposition and the plain one.
+    #[test]
+    fn planes_become_groups_and_groups_become_planes() {
+        let (channels, height, width) = (35, 7, 21);
+        let plane = height * width;
+        let data: Vec<f32> = (0..channels * plane).map(|i| i as f32 - 2000.0).collect();
+        let plain = Transposer {
+            #[cfg(target_arch = "x86_64")]
+            wide: None,
+        };
+        for (transposer, rectified) in
+            [(plain, false), (plain, true), (Transposer::new(), false), (Transposer::new(), true)]
+        {
+            let planes = Planes { data: &data, height, width, rectified, transposer };
+            let mut out = vec![0.0; channels * plane];
+            for (group, out) in out.chunks_mut(GROUP * plane).enumerate() {
+                let mut pixels = vec![f32::NAN; plane * GROUP];
+                for (row, pixels) in pixels.chunks_exact_mut(width * GROUP).enumerate() {
+                    planes.read(group, Some(row), 0, pixels);
+                }
+                let mask = rectified.then(|| (&data[group * GROUP * plane..], plane));
+                let mut slices: Vec<_> = out.chunks_exact_mut(plane).collect();
+                Scatter { pixels: &pixels, planes: &mut slices, mask }.run(transposer);
+            }
+            let expected: Vec<f32> = data.iter().map(|x| if rectified { x.max(0.0) } else { *x }).collect();
+            assert_eq!(out, expected);
+        }
+    }
+
+    #[test]
+    fn outside_of_the_image_everything_is_0() {
+        let data: Vec<f32> = (1..=6).map(|i| i as f32).collect();
+        let planes =
+            Planes { data: &data, height: 2, width: 3, rectified: false, transposer: Transposer::new() };
+        let mut out = vec![f32::NAN; 5 * GROUP];
+        planes.read(0, Some(1), -1, &mut out);
+        let first: Vec<f32> = out.iter().step_by(GROUP).copied().collect();
+        assert_eq!(first, [0.0, 4.0, 5.0, 6.0, 0.0]);
+        planes.read(0, Some(2), 0, &mut out);
+        assert_eq!(out, [0.0; 5 * GROUP]);
+    }
+}
