@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::samples as s;
+use super::{checks, samples as s};
 
 /// Whether the output in this folder is whole; else the fault.
 type Check = fn(&Path) -> Result<(), String>;
@@ -36,19 +36,19 @@ fn format(name: &'static str, sample: fn(&Path), changed: &'static str, command:
 
 fn reconstruct(name: &'static str, sample: fn(&Path), changed: &'static str, arguments: &str) -> Format {
     let command = format!("reconstruct {arguments} --weights in/w.safetensors --device cpu -v -o out.ply");
-    format(name, sample, changed, &command).writes("out.ply", s::person)
+    format(name, sample, changed, &command).writes("out.ply", checks::person)
 }
 
 fn render(name: &'static str, sample: fn(&Path), file: &'static str) -> Format {
     let command =
         format!("render in/{file} --orbit 2 --size 16x24 --device cpu -o out --raw out.safetensors");
-    format(name, sample, file, &command).writes("out.safetensors", s::rendered)
+    format(name, sample, file, &command).writes("out.safetensors", checks::rendered)
 }
 
 fn prepare(name: &'static str, sample: fn(&Path), changed: &'static str, arguments: &str) -> Format {
     let small = "--set views.count=2 --set views.resolution=16 --set views.samples_per_axis=1";
     let format = format(name, sample, changed, &format!("prepare {arguments} -o out {small}"));
-    Format { kept: &["out/dataset.toml", "out/prepare.config.toml"], is_whole: s::data_set, ..format }
+    Format { kept: &["out/dataset.toml", "out/prepare.config.toml"], is_whole: checks::data_set, ..format }
 }
 
 /// A rehearsal, which writes nothing. Settings that could make it slow are fixed.
@@ -118,14 +118,14 @@ pub fn all() -> Vec<Format> {
             "w.safetensors",
             "export-weights in/w.safetensors -o out.safetensors",
         )
-        .writes(tensors, s::tensors),
+        .writes(tensors, checks::tensors),
         format(
             "weights-import",
             s::weights,
             "w.safetensors c.toml",
             "import-weights in/w.safetensors --config in/c.toml -o out.safetensors",
         )
-        .writes(tensors, s::weight_file)
+        .writes(tensors, checks::weight_file)
         .share(28),
         format(
             "checkpoint",
@@ -133,7 +133,7 @@ pub fn all() -> Vec<Format> {
             "stage1.pth stage2.pth",
             "import-weights in/stage1.pth in/stage2.pth --config in/c.toml -o out.safetensors",
         )
-        .writes(tensors, s::weight_file),
+        .writes(tensors, checks::weight_file),
         render("gaussians", |folder| s::gaussians(folder, "h.ply"), "h.ply"),
         render("gaussians-ascii", s::gaussians_ascii, "h.ply"),
         render("gaussians-big-endian", s::gaussians_big_endian, "h.ply"),
@@ -141,10 +141,10 @@ pub fn all() -> Vec<Format> {
         render("spz", |folder| s::gaussians(folder, "h.spz"), "h.spz"),
         // With spherical harmonics, from another implementation.
         format("spz-harmonics", s::spz_harmonics, "h.spz", "convert in/h.spz out.ply")
-            .writes("out.ply", s::scene),
+            .writes("out.ply", checks::scene),
         // A mesh takes seconds, hence few cases.
         format("gaussians-mesh", s::column, "h.ply", "mesh in/h.ply --faces 500 --device cpu -o out.ply")
-            .writes("out.ply", s::mesh)
+            .writes("out.ply", checks::mesh)
             .share(1),
         format(
             "cameras",
@@ -152,7 +152,7 @@ pub fn all() -> Vec<Format> {
             "cameras.json",
             "render in/h.ply --cameras in/cameras.json --device cpu -o out",
         )
-        .checked(s::rendered_by_cameras),
+        .checked(checks::rendered_by_cameras),
         prepare("obj", s::obj_and_textures, ".obj .mtl .png .tiff", "scan in/a.obj").share(48),
         prepare("mesh-ply", |folder| s::ply(folder, "binary_little_endian"), ".ply", "scan in/a.ply"),
         prepare("mesh-ply-big-endian", |folder| s::ply(folder, "binary_big_endian"), ".ply", "scan in/a.ply"),
@@ -185,20 +185,20 @@ pub fn all() -> Vec<Format> {
             "evaluation",
             evaluated,
             &format!("evaluate --config in/e.toml {trained} --device cpu"),
-            |folder| s::report(folder, "protocols"),
+            |folder| checks::report(folder, "protocols"),
         )
         .share(16),
         report(
             "evaluation-mesh",
             "0000.obj",
             "evaluate --config in/e.toml --mesh-dir in/scans --align similarity",
-            |folder| s::report(folder, "geometry_cm"),
+            |folder| checks::report(folder, "geometry_cm"),
         ),
         report(
             "bench-config",
             "b.toml",
             &format!("bench --config in/b.toml --quick {trained} --device cpu"),
-            |folder| s::report(folder, "settings"),
+            |folder| checks::report(folder, "settings"),
         ),
         format(
             "compare",

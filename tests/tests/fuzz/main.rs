@@ -6,6 +6,7 @@
 
 mod case;
 mod change;
+mod checks;
 mod envelope;
 mod formats;
 mod run;

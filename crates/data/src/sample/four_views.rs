@@ -26,7 +26,7 @@ pub(super) struct FourViews {
     /// without `points` of the config.
     pub first: Points,
     /// Points `[2,H,W,3]` and validity `[2,H,W]` of the second surfaces of right and left. Empty without sides or
-    /// without `samples.second_depth`.
+    /// without `network.second_layer`.
     pub second: Points,
     /// Moves upright points back to the photographed person.
     pub restoration: Option<Restoration>,

@@ -32,7 +32,7 @@ pub struct Stage1Item {
     /// `[4,H,W]` or `[2,H,W]`: 1 for pixels that have a point, 0 for others.
     pub valid: Vec<f32>,
     /// `[2,H,W,3]` points of the second surfaces that face the cameras of right and left, as `points`. Empty without
-    /// `samples.second_depth`.
+    /// `network.second_layer`.
     pub second_points: Vec<f32>,
     /// `[2,H,W]` as `valid`, for `second_points`.
     pub second_valid: Vec<f32>,
