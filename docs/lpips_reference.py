@@ -65,8 +65,4 @@ if __name__ == "__main__":
         a, b = (tensor(numbers(stream, 3 * h * w), [1, 3, h, w]) for stream in (100, 101))
         # Half noise, half the same: not all pictures are as far apart as noise.
         b = 0.5 * a + 0.5 * b
-        a.requires_grad_(True)
-        distance = metric(a, b, normalize=True)
-        distance.sum().backward()
-        gradient = a.grad.double()
-        print(h, w, repr(distance.item()), repr(gradient.norm().item()), repr(gradient.sum().item()))
+        print(h, w, repr(metric(a, b, normalize=True).item()))

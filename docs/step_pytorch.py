@@ -2,7 +2,7 @@
 
     pip install torch
     cargo bench --workspace --bench step --no-run       # prints the program's path
-    python docs/step_pytorch.py PROGRAM [--threads 2] [--seconds 20] [--side 256] [--batch 2] [--network tiny]
+    python docs/step_pytorch.py PROGRAM [--threads 2] [--seconds 20] [--side 256] [--batch 2]
     python docs/step_pytorch.py PROGRAM --network default --side 128 --batch 4 [--wide]
     python docs/step_pytorch.py PROGRAM --memory [...]  # each network alone, and the most memory of its process
 
@@ -29,7 +29,6 @@ PATCH, CHANNELS = 16, 3
 NETWORKS = {
     "default": (128, 4, 6, 4, (), (32, 64, 96, 128), 0, 32),
     "small": (192, 3, 6, 4, (0, 2, 3, 4), (32, 64, 96, 128), 64, 32),
-    "tiny": (128, 4, 4, 3, (0, 1, 2, 3), (16, 32, 48, 64), 32, 16),
 }
 WIDTH, HEADS, ENCODER, DECODER, HOOKS, BRANCHES, FEATURES, LAST = NETWORKS["small"]
 

@@ -12,13 +12,13 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use burn::data::dataloader::batcher::Batcher;
+use burn::module::Module;
 use burn::tensor::Device;
 use snapsnap_base::FileError;
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::DataConfig;
-use snapsnap_data::sample::{Augment, SampleConfig, Stage1, Stage1Batcher, Stage1Item};
+use snapsnap_data::sample::{Augment, SampleConfig, Stage1, Stage1Batch, Stage1Item};
 use snapsnap_net::config::Config;
 use snapsnap_net::network::View;
 use snapsnap_net::steps::Record;
@@ -76,7 +76,7 @@ fn data_set(root: &Path, resolution: usize) -> Result<Arc<Folder>, FileError> {
 /// The losses of these samples.
 fn compare(networks: &Networks, config: &Config, items: Vec<Stage1Item>, device: &Device) -> Losses {
     let predictor = networks.predictor.as_ref().expect("the predictor is trained");
-    let batch = Stage1Batcher.batch(items, device);
+    let batch = Stage1Batch::new(items, device);
     let mut record = Record::default();
     let masks = batch.masks.to_data().try_to_vec::<f32>().expect("numbers");
     let window = Window::of_predictor(config, Window::around_person(&masks, config.network.resolution));

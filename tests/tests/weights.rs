@@ -6,15 +6,15 @@ use std::path::Path;
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use snapsnap_base::config::Schema;
-use snapsnap_net::config::Config;
+use snapsnap_net::config::{Config, Precision};
 use snapsnap_net::weights::{
-    Entry, Float, ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init, schema,
+    Entry, ImportOptions, SideHeads, Source, WeightFile, WeightsError, export, import, init, schema,
 };
 use snapsnap_tests::workplace::Workplace;
 use snapsnap_tests::{FIXTURE_VALUES, data, fixture, root};
 
 const OPTIONS: ImportOptions =
-    ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 3, float: Float::F32 };
+    ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 3, float: Precision::F32 };
 
 fn tiny() -> Config {
     Config::from_file(&root().join("configs/tiny.toml"), &[]).expect("tiny.toml")
@@ -120,7 +120,7 @@ fn a_dust3r_file_gets_delta_and_side_heads_and_says_so() {
     dust3r.insert("mask_token".into(), (Dtype::F32, vec![1], vec![0; 4]));
     write(&dust3r, &from);
     let with = |side_heads| {
-        let options = ImportOptions { fill: None, side_heads, seed: 5, float: Float::F32 };
+        let options = ImportOptions { fill: None, side_heads, seed: 5, float: Precision::F32 };
         let report = import(std::slice::from_ref(&from), &tiny(), options, &to, &|_, _| ()).expect("imports");
         (read(&to), report.notes.join("\n"))
     };

@@ -4,8 +4,6 @@ use super::{cargo, succeeds};
 
 const USAGE: &str = "usage: cargo xtask fuzz [--minutes N] [--only FORMAT] [--from SEED]
 
-Damaged files of every format that the program reads: each must be read whole or refused, in bounded time and memory.
-
   --minutes N    seed after seed of all formats for N minutes [default: one seed, as the suite does]
   --only FORMAT  only formats whose names begin so; names are in tests/tests/fuzz/formats.rs
   --from SEED    the first seed [default: 0]";

@@ -162,7 +162,7 @@ impl Batch {
     }
 }
 
-/// Turns a panic, whose message is printed, into a failure of one input.
+/// Turns a panic, whose message is printed, into a failure.
 pub fn unpanicked<T>(work: impl FnOnce() -> Result<T, Failure>) -> Result<T, Failure> {
     let bug = |_| Err(Failure::Internal("a bug in this program; its message is above".into()));
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(bug)
@@ -202,10 +202,7 @@ fn scenes(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Failure> {
         let name = stem(&path)?;
         // Some file systems do not tell upper from lower case.
         if let Some(other) = names.insert(name.to_lowercase(), path.clone()) {
-            return Err(Failure::file(
-                &path,
-                format_args!("has the same name as {}: rename one of them", other.display()),
-            ));
+            return Err(same_name(&path, &other));
         }
         found.insert(name, path);
     }
@@ -213,6 +210,11 @@ fn scenes(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Failure> {
         return Err(Failure::file(folder, "has no PLY, SPZ or GLB"));
     }
     Ok(found)
+}
+
+/// The failure of two files with one name.
+pub fn same_name(path: &Path, other: &Path) -> Failure {
+    Failure::file(path, format_args!("has the same name as {}: rename one of them", other.display()))
 }
 
 /// A file's name without extension.

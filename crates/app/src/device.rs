@@ -36,8 +36,8 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
         "ndarray" => return Ok(ndarray()),
         _ => {}
     }
-    match gpus().into_iter().find(|(compiled, _)| *compiled == kind) {
-        Some((_, kind)) => nth(name, kind, index),
+    match gpus().into_iter().find(|(compiled, ..)| *compiled == kind) {
+        Some((.., kind)) => nth(name, kind, index),
         None if ["vulkan", "cuda", "metal"].contains(&kind) => {
             Err(unknown(name, &format!("not compiled in: build with --features {kind}")))
         }
@@ -74,7 +74,7 @@ pub fn choose_in_turn(name: &str, turn: usize) -> Result<Device, Failure> {
 
 /// Both CPU backends, and of every compiled kind the first card, or else a software adapter that can run kernels.
 pub fn all() -> Vec<Device> {
-    let gpus = gpus().into_iter().filter_map(|(name, _)| choose(name).ok());
+    let gpus = gpus().into_iter().filter_map(|(name, ..)| choose(name).ok());
     [Device::flex(), ndarray()].into_iter().chain(gpus).collect()
 }
 
@@ -121,13 +121,7 @@ pub const PROBE: &str = "probe-adapters";
 
 /// The answers of the graphics drivers, as JSON.
 pub fn probe() -> String {
-    let of_kind = |(kind, device_type): (&str, DeviceType)| {
-        let backend = match kind {
-            "wgpu" => "wgpu, WGSL",
-            "vulkan" => "wgpu, SPIR-V",
-            "metal" => "wgpu, MSL",
-            _ => "CUDA",
-        };
+    let of_kind = |(kind, backend, device_type): (&str, &str, DeviceType)| {
         let adapter = |(index, device): (usize, Device)| Adapter {
             name: format!("{kind}:{index}"),
             adapter: device.identity().map_or_else(|| "?".into(), |identity| identity.name),
@@ -167,7 +161,7 @@ pub fn is_opengl() -> bool {
 
 /// Kinds of devices of this build.
 pub fn compiled_in() -> Vec<&'static str> {
-    ["cpu", "ndarray"].into_iter().chain(gpus().into_iter().map(|(name, _)| name)).collect()
+    ["cpu", "ndarray"].into_iter().chain(gpus().into_iter().map(|(name, ..)| name)).collect()
 }
 
 fn processor() -> String {
@@ -177,16 +171,16 @@ fn processor() -> String {
     brand.filter(|brand| !brand.is_empty()).unwrap_or_else(|| "this processor".into())
 }
 
-/// Kinds of GPU devices that are compiled in, best first.
-fn gpus() -> Vec<(&'static str, DeviceType)> {
+/// Kinds of GPU devices that are compiled in, best first, each with its backend.
+fn gpus() -> Vec<(&'static str, &'static str, DeviceType)> {
     vec![
         #[cfg(feature = "cuda")]
-        ("cuda", DeviceType::Cuda),
+        ("cuda", "CUDA", DeviceType::Cuda),
         #[cfg(feature = "metal")]
-        ("metal", DeviceType::Metal),
+        ("metal", "wgpu, MSL", DeviceType::Metal),
         #[cfg(feature = "vulkan")]
-        ("vulkan", DeviceType::Vulkan),
-        ("wgpu", DeviceType::Wgpu),
+        ("vulkan", "wgpu, SPIR-V", DeviceType::Vulkan),
+        ("wgpu", "wgpu, WGSL", DeviceType::Wgpu),
     ]
 }
 

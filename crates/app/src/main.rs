@@ -8,9 +8,7 @@
 
 mod arguments;
 mod batch;
-mod camera_options;
 mod commands;
-mod cutouts;
 mod device;
 mod downloads;
 mod dump;

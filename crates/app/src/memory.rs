@@ -6,7 +6,7 @@ use burn::tensor::Device;
 use snapsnap_net::weights::WeightFile;
 use sysinfo::{MemoryRefreshKind, RefreshKind, System};
 
-use crate::failure::Failure;
+use crate::failure::{Failure, bail};
 
 /// Refuses work on the CPU that needs more bytes than this process can have. The message contains the work (`what`) and
 /// the remedy (`mend`).
@@ -16,10 +16,7 @@ pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
         return Ok(());
     }
     let [needed, there] = [needed, there].map(|bytes| bytes as f64 / 1e9);
-    let message = format!(
-        "{what} needs {needed:.1} GB of memory, but this process can have only {there:.1} GB: {mend}"
-    );
-    Err(Failure::Input(message))
+    bail!("{what} needs {needed:.1} GB of memory, but this process can have only {there:.1} GB: {mend}")
 }
 
 /// Whether the device is the CPU, which uses the machine's memory.

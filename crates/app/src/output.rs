@@ -85,7 +85,7 @@ pub fn outside_data<'a>(path: &Path, roots: impl IntoIterator<Item = &'a Path>) 
 /// The canonical path of a file, which may be missing.
 pub fn place(path: &Path) -> PathBuf {
     let path = file::target_of(path);
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = file::folder_of(&path);
     let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
     folder.join(path.file_name().unwrap_or_default())
 }

@@ -41,21 +41,13 @@ const INDEX: &str = include_str!("../viewer/index.html");
 /// The part of [`INDEX`] that tells the page's script which command serves it.
 const VIEW: &str = "<html lang=\"en\" class=\"view\">";
 
-/// A command's page.
-#[derive(Clone, Copy)]
-pub enum Kind {
-    /// Shows a file.
-    View,
-    /// Makes people of photographs.
-    Studio,
-}
-
-/// Serves the page until the program ends. `shows` is its content in words; `rest` answers requests for other paths.
+/// Serves the page of a command, `view` or `studio`, until the program ends. `shows` is its content in words; `rest`
+/// answers requests for other paths, or refuses them with an answer.
 pub fn show(
-    kind: Kind,
+    command: &str,
     arguments: &PageArguments,
     shows: &str,
-    rest: &(dyn Fn(&Request, &mut Body) -> Answer + Sync),
+    rest: &(dyn Fn(&Request, &mut Body) -> Result<Answer, Answer> + Sync),
 ) -> Result<(), Failure> {
     let wanted = arguments.port.unwrap_or(0);
     let cannot = |e: io::Error| Failure::Input(format!("--port {wanted}: cannot listen on 127.0.0.1: {e}"));
@@ -72,7 +64,8 @@ pub fn show(
         say::err(&format!("warning: --open: no browser could be started ({e}); open {url} by hand"));
     }
     serve(&listener, &|request, body| {
-        refused(request, port).or_else(|| file(kind, request)).unwrap_or_else(|| rest(request, body))
+        let answer = refused(request, port).or_else(|| file(command, request));
+        answer.unwrap_or_else(|| rest(request, body).unwrap_or_else(|refused| refused))
     })
 }
 
@@ -98,15 +91,12 @@ fn refused(request: &Request, port: u16) -> Option<Answer> {
 }
 
 /// A file of the page.
-fn file(kind: Kind, request: &Request) -> Option<Answer> {
+fn file(command: &str, request: &Request) -> Option<Answer> {
     if !is_read(request) {
         return None;
     }
     if request.path == "/" {
-        let index = match kind {
-            Kind::View => INDEX.to_owned(),
-            Kind::Studio => INDEX.replace(VIEW, &VIEW.replace("view", "studio")),
-        };
+        let index = INDEX.replace(VIEW, &VIEW.replace("view", command));
         return Some(answer("text/html; charset=utf-8", Arc::new(index)));
     }
     let (_, kind, content) = FILES.iter().find(|(name, ..)| *name == request.path)?;

@@ -1,14 +1,16 @@
-//! Rendered views as picture files.
+//! Rendered views and cut-out photographs as picture files.
 
-use std::path::Path;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
 
 use burn::tensor::Tensor;
 use image::buffer::ConvertBuffer;
 use image::codecs::gif::{GifEncoder, Repeat};
-use image::{Delay, Frame, RgbImage, imageops};
+use image::{Delay, Frame, GrayImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage, imageops};
 use snapsnap_eval::preview;
 
 use crate::failure::Failure;
+use crate::output::{check_folder, make_folder, write};
 
 /// Speed of the search for a GIF's colours: 1 is best, 30 fastest.
 const GIF_SPEED: i32 = 10;
@@ -56,4 +58,23 @@ pub fn sheet(pictures: &[RgbImage], columns: u32) -> RgbImage {
         imageops::replace(&mut sheet, picture, x, y);
     }
     sheet
+}
+
+/// `--save-cutouts`: paths of front and back in the folder. Refuses a path that is no folder and cannot become one.
+pub fn cutout_paths(folder: &Path) -> Result<[PathBuf; 2], Failure> {
+    check_folder(folder)?;
+    Ok(["front.png", "back.png"].map(|name| folder.join(name)))
+}
+
+/// Writes a photograph with its mask as alpha channel, and makes the folder. Colours without coverage are black.
+pub fn save_cutout(path: &Path, rgb: &RgbImage, mask: &GrayImage) -> Result<(), Failure> {
+    make_folder(path.parent().expect("a name in the folder"))?;
+    let pixels = RgbaImage::from_fn(rgb.width(), rgb.height(), |x, y| {
+        let (Rgb([r, g, b]), alpha) = (*rgb.get_pixel(x, y), mask.get_pixel(x, y)[0]);
+        if alpha > 0 { Rgba([r, g, b, alpha]) } else { Rgba([0; 4]) }
+    });
+    let mut bytes = Vec::new();
+    let encoded = pixels.write_to(&mut Cursor::new(&mut bytes), ImageFormat::Png);
+    encoded.map_err(|e| Failure::Internal(format!("{}: cannot encode: {e}", path.display())))?;
+    write(path, &bytes)
 }

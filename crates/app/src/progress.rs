@@ -13,6 +13,12 @@ const LINE_BYTES: u64 = 500_000_000;
 /// Plain lines over all steps of a command.
 const LINES: u64 = 10;
 
+/// The bar with this template, on a terminal and without --quiet.
+pub fn shown(bar: ProgressBar, template: &str) -> Option<ProgressBar> {
+    let style = || ProgressStyle::with_template(template).expect("a valid template");
+    (!say::is_quiet() && std::io::stderr().is_terminal()).then(|| bar.with_style(style()))
+}
+
 /// Progress of one command.
 pub struct Progress {
     bar: Option<ProgressBar>,
@@ -51,13 +57,10 @@ impl Progress {
     }
 
     fn new(bar: ProgressBar, template: &str) -> Self {
-        let (quiet, terminal) = (say::is_quiet(), std::io::stderr().is_terminal());
-        let bar = (!quiet && terminal).then(|| {
-            bar.set_style(ProgressStyle::with_template(template).expect("a valid template"));
-            bar.enable_steady_tick(Duration::from_millis(100));
-            bar
-        });
-        Self { bar, plain: !quiet && !terminal, reported: Cell::new(0), start: Instant::now() }
+        let bar = shown(bar, template);
+        bar.iter().for_each(|bar| bar.enable_steady_tick(Duration::from_millis(100)));
+        let plain = bar.is_none() && !say::is_quiet();
+        Self { bar, plain, reported: Cell::new(0), start: Instant::now() }
     }
 
     /// Reports the start of a module.

@@ -10,7 +10,7 @@ use snapsnap_eval::evaluate::LeftOut;
 use snapsnap_eval::report::{Header, today};
 
 use crate::failure::Failure;
-use crate::output::{self, check_outputs, make_folder};
+use crate::output::{self, check_folder, check_outputs, make_folder};
 use crate::say;
 
 /// Files of the reports of all commands but `demo`.
@@ -50,9 +50,7 @@ impl ReportFolder {
 
     /// [`ReportFolder::new`] for a report with other files, the last of which is [`REPORT`].
     pub fn of(path: &Path, files: &'static [&'static str], inputs: &[&Path]) -> Result<Self, Failure> {
-        if path.exists() && !path.is_dir() {
-            return Err(Failure::file(path, "exists and is no folder"));
-        }
+        check_folder(path)?;
         let is_new = !path.exists();
         make_folder(path)?;
         let folder = Self { path: path.to_owned(), files, is_new, written: RefCell::default() };

@@ -82,12 +82,9 @@ pub fn written(outcome: std::io::Result<()>) -> Result<(), Failure> {
 
 /// The text with escaped control characters, but for line breaks and tabs.
 pub fn printable(text: &str) -> String {
-    let mut printable = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            c if c.is_control() && c != '\n' && c != '\t' => printable.extend(c.escape_default()),
-            c => printable.push(c),
-        }
-    }
-    printable
+    let shown = |c: char| match c {
+        c if c.is_control() && c != '\n' && c != '\t' => c.escape_default().to_string(),
+        c => c.to_string(),
+    };
+    text.chars().map(shown).collect()
 }

@@ -250,9 +250,12 @@ fn request(stream: &mut TcpStream) -> io::Result<Result<(Request, Vec<u8>), Refu
 }
 
 fn checked(parsed: &httparse::Request) -> Result<Request, Refusal> {
-    let mut hosts = parsed.headers.iter().filter(|header| header.name.eq_ignore_ascii_case("host"));
-    let host = hosts.next().map(|header| String::from_utf8_lossy(header.value).into_owned());
-    if hosts.next().is_some() {
+    let named = |name: &'static str| {
+        let found = parsed.headers.iter().filter(move |header| header.name.eq_ignore_ascii_case(name));
+        found.map(|header| String::from_utf8_lossy(header.value).into_owned())
+    };
+    let header = |name| named(name).next();
+    if named("host").count() > 1 {
         return Err((StatusCode::BAD_REQUEST, "two Host headers"));
     }
     let target = parsed.path.unwrap_or_default();
@@ -260,14 +263,10 @@ fn checked(parsed: &httparse::Request) -> Result<Request, Refusal> {
     let path =
         target.strip_prefix("http://").map_or(target, |rest| rest.find('/').map_or("/", |at| &rest[at..]));
     let path = path.split(['?', '#']).next().unwrap_or_default().to_owned();
-    let header = |name: &str| {
-        let found = parsed.headers.iter().find(|header| header.name.eq_ignore_ascii_case(name))?;
-        Some(String::from_utf8_lossy(found.value).into_owned())
-    };
     let length = header("content-length").and_then(|length| length.trim().parse().ok());
     Ok(Request {
         path,
-        host,
+        host: header("host"),
         method: parsed.method.unwrap_or_default().to_owned(),
         origin: header("origin"),
         fetch_site: header("sec-fetch-site"),

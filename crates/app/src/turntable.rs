@@ -68,10 +68,8 @@ impl Turntable {
         let count = if matches!(self, Self::Sheet(_)) { SHEET } else { FRAMES };
         let orbit = Camera::orbit(count, SIZE, SIZE);
         let progress = Progress::steps(count, "views");
-        let view = |camera: &Camera| {
-            picture(&render(gaussians, slice::from_ref(camera), &RenderOptions::inria())?.color)
-        };
-        let pictures = views(&orbit, &view, &|done, all| progress.step(done, all, "views"))?;
+        let done = |done, all| progress.step(done, all, "views");
+        let pictures = views(&gaussians.clone().into(), &orbit, &RenderOptions::inria(), &done)?;
         drop(progress);
         match self {
             Self::Gif(path) => write(path, &gif(&pictures, FRAMES_PER_SECOND)?),
@@ -91,16 +89,18 @@ impl Turntable {
 /// pictures. Refuses scenes that would take far longer than a person's.
 pub fn all_around(scene: &Loaded, done: &dyn Fn(usize, usize)) -> Result<Vec<RgbImage>, Failure> {
     let options = RenderOptions { max_intersections: MAX_INTERSECTIONS, ..RenderOptions::inria() };
-    let view =
-        |camera: &Camera| picture(&render(&scene.seen_by(camera)?, slice::from_ref(camera), &options)?.color);
-    views(&Camera::orbit(FRAMES, SIZE, SIZE), &view, done)
+    views(scene, &Camera::orbit(FRAMES, SIZE, SIZE), &options, done)
 }
 
 fn views(
+    scene: &Loaded,
     cameras: &[Camera],
-    view: &dyn Fn(&Camera) -> Result<RgbImage, Failure>,
+    options: &RenderOptions,
     done: &dyn Fn(usize, usize),
 ) -> Result<Vec<RgbImage>, Failure> {
-    let counted = |(i, camera)| view(camera).inspect(|_| done(i + 1, cameras.len()));
-    cameras.iter().enumerate().map(counted).collect()
+    let view = |(i, camera)| {
+        let rendered = render(&scene.seen_by(camera)?, slice::from_ref(camera), options)?;
+        picture(&rendered.color).inspect(|_| done(i + 1, cameras.len()))
+    };
+    cameras.iter().enumerate().map(view).collect()
 }

@@ -17,8 +17,8 @@ pub const CAMERAS: &str = "cameras.json";
 pub struct ViewFolder {
     pub path: PathBuf,
     views: usize,
-    /// The folder's cameras are an input of the command and are not replaced.
-    keeps_cameras: bool,
+    /// Whether the folder's cameras are an input of the command. They are not replaced then.
+    pub keeps_cameras: bool,
 }
 
 impl ViewFolder {
@@ -27,11 +27,6 @@ impl ViewFolder {
         check_folder(path)?;
         let keeps_cameras = given.is_some_and(|given| is_same_file(given, &path.join(CAMERAS)));
         Ok(Self { path: path.to_owned(), views, keeps_cameras })
-    }
-
-    /// Whether the folder's cameras are an input of the command.
-    pub fn keeps_cameras(&self) -> bool {
-        self.keeps_cameras
     }
 
     /// Names of the files that will be written.

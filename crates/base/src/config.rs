@@ -135,8 +135,16 @@ pub fn differences(
     differing.map(|key| (key.clone(), message(key))).collect()
 }
 
+/// Messages of the parser quote lines of the file, which may be of any length.
 fn syntax(origin: &str, message: String) -> ConfigError {
-    ConfigError::Syntax { origin: origin.to_owned(), message }
+    /// Characters that are shown of a line.
+    const SHOWN: usize = 200;
+    let short = |line: &str| match line.char_indices().nth(SHOWN) {
+        Some((end, _)) => format!("{}…", &line[..end]),
+        None => line.to_owned(),
+    };
+    let lines: Vec<String> = message.lines().map(short).collect();
+    ConfigError::Syntax { origin: origin.to_owned(), message: lines.join("\n") }
 }
 
 /// Removed keys of a config with their values.
@@ -389,6 +397,13 @@ mod tests {
         let message = read("[network]\nslope = 3.0\n").expect_err("another value");
         assert_eq!(message, "x: `network.slope` is gone: it is always 4.0, and cannot be 3.0");
         assert!(is_gone::<Config>("network.slope", "4.0") && !is_gone::<Config>("network.dim", "4.0"));
+    }
+
+    #[test]
+    fn a_message_quotes_the_beginning_of_a_long_line() {
+        let text = format!("[network]\nname = [{}\n", "1, ".repeat(100_000));
+        let message = Config::from_toml(&text, "x", &[]).expect_err("a list").to_string();
+        assert!(message.contains("name = [1, 1") && message.len() < 2000, "{}", message.len());
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::collections::HashSet;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -111,14 +111,11 @@ fn create(path: &Path) -> io::Result<File> {
 }
 
 /// Folders that this run has tidied.
-fn tidied() -> &'static Mutex<HashSet<PathBuf>> {
-    static TIDIED: OnceLock<Mutex<HashSet<PathBuf>>> = OnceLock::new();
-    TIDIED.get_or_init(Mutex::default)
-}
+static TIDIED: LazyLock<Mutex<HashSet<PathBuf>>> = LazyLock::new(Mutex::default);
 
 /// Removes the temporary files that killed runs have left in `folder`. Each process does this once per folder.
 fn tidy(folder: &Path) {
-    if !tidied().lock().unwrap_or_else(PoisonError::into_inner).insert(folder.to_owned()) {
+    if !TIDIED.lock().unwrap_or_else(PoisonError::into_inner).insert(folder.to_owned()) {
         return;
     }
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
@@ -145,27 +142,25 @@ fn tidy(folder: &Path) {
 ///
 /// # Errors
 /// The operating system's refusal, or the end of the file before the buffer is full.
-#[cfg(unix)]
 pub fn read_exact_at(file: &File, buffer: &mut [u8], offset: u64) -> io::Result<()> {
-    std::os::unix::fs::FileExt::read_exact_at(file, buffer, offset)
-}
-
-/// Fills `buffer` from byte `offset` on. Several threads may read one file at the same time.
-///
-/// # Errors
-/// The operating system's refusal, or the end of the file before the buffer is full.
-#[cfg(windows)]
-pub fn read_exact_at(file: &File, mut buffer: &mut [u8], mut offset: u64) -> io::Result<()> {
-    while !buffer.is_empty() {
-        match std::os::windows::fs::FileExt::seek_read(file, buffer, offset)? {
-            0 => return Err(io::ErrorKind::UnexpectedEof.into()),
-            n => {
-                buffer = &mut buffer[n..];
-                offset += n as u64;
+    #[cfg(unix)]
+    {
+        std::os::unix::fs::FileExt::read_exact_at(file, buffer, offset)
+    }
+    #[cfg(windows)]
+    {
+        let (mut buffer, mut offset) = (buffer, offset);
+        while !buffer.is_empty() {
+            match std::os::windows::fs::FileExt::seek_read(file, buffer, offset)? {
+                0 => return Err(io::ErrorKind::UnexpectedEof.into()),
+                n => {
+                    buffer = &mut buffer[n..];
+                    offset += n as u64;
+                }
             }
         }
+        Ok(())
     }
-    Ok(())
 }
 
 /// Writes `path`: `fill` writes a temporary file beside it, which is renamed after success. A failure leaves the
@@ -315,7 +310,8 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     text.map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "is no text (UTF-8)"))
 }
 
-fn folder_of(path: &Path) -> &Path {
+/// The folder that contains `path`.
+pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
@@ -339,20 +335,14 @@ mod tests {
 
     #[test]
     #[cfg(unix)]
-    fn permissions_are_handed_on_and_respected() {
+    fn a_write_protected_file_is_kept() {
         use std::os::unix::fs::PermissionsExt;
         let folder = tempfile::tempdir().expect("temporary folder");
         let path = folder.path().join("a.txt");
-        let mode = |mode: u32| fs::set_permissions(&path, fs::Permissions::from_mode(mode)).expect("chmod");
-        let new = || write_whole::<io::Error>(&path, |out| out.write_all(b"new"));
         fs::write(&path, "old").expect("write");
-        mode(0o600);
-        new().expect("writes");
-        assert_eq!(fs::metadata(&path).expect("there").permissions().mode() & 0o777, 0o600);
-        fs::write(&path, "old").expect("write");
-        mode(0o444);
-        assert!(check_writable(&path).expect_err("refuses").to_string().contains("write-protected"));
-        assert!(new().expect_err("refuses").to_string().contains("write-protected"));
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o444)).expect("chmod");
+        let refused = write_whole::<io::Error>(&path, |out| out.write_all(b"new"));
+        assert!(refused.expect_err("refuses").to_string().contains("write-protected"));
         assert_eq!(fs::read_to_string(&path).expect("read"), "old");
     }
 
@@ -376,7 +366,7 @@ mod tests {
                 old(&entry.expect("entry").path());
             }
             // As if another run began now.
-            tidied().lock().unwrap_or_else(PoisonError::into_inner).clear();
+            TIDIED.lock().unwrap_or_else(PoisonError::into_inner).clear();
             tidy(folder.path());
             out.write_all(b"whole")
         })

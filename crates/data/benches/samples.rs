@@ -1,11 +1,9 @@
 //! Samples per second and memory of the loader: `cargo bench --workspace --bench samples -- [--full]`. `--full` also
-//! measures the memory of 10,000 samples. With `--data DATASET…` it measures one pass of stage 1 over these data sets
-//! instead, in random order.
+//! measures the memory of 10,000 samples.
 
 use std::sync::Arc;
 use std::time::Instant;
 
-use burn::data::dataset::Dataset;
 use peak_alloc::PeakAlloc;
 use snapsnap_data::dataset::{Folder, Layout, Split};
 use snapsnap_data::prepare::DataConfig;
@@ -33,39 +31,18 @@ fn measure<I: Send + Sync + 'static>(name: &str, loader: &Loader<I>, count: usiz
     ALLOCATOR.reset_peak_usage();
     let before = ALLOCATOR.current_usage_as_mb();
     let start = Instant::now();
-    let mut loaded = 0;
-    'all: for pass in 0.. {
-        for batch in loader.batches(pass, 0) {
-            batch.expect("loads");
-            loaded += 1;
-            if [100, 1000, 10_000].contains(&loaded) || loaded == count {
-                let rate = loaded as f64 / start.elapsed().as_secs_f64();
-                let peak = ALLOCATOR.peak_usage_as_mb() - before;
-                println!("| {name} | {loaded} | {rate:.1} | {peak:.0} MB |");
-            }
-            if loaded == count {
-                break 'all;
-            }
+    let batches = (0..).flat_map(|pass| loader.batches(pass, 0)).take(count);
+    for (loaded, batch) in (1_u32..).zip(batches) {
+        batch.expect("loads");
+        if [100, 1000, 10_000].contains(&loaded) {
+            let rate = f64::from(loaded) / start.elapsed().as_secs_f64();
+            let peak = ALLOCATOR.peak_usage_as_mb() - before;
+            println!("| {name} | {loaded} | {rate:.1} | {peak:.0} MB |");
         }
     }
 }
 
-/// One pass over the training people of a data set, without augmentation.
-fn pass(root: &str) {
-    let folder = Arc::new(Folder::open(std::path::Path::new(root)).expect("opens"));
-    let config = SampleConfig { augment: Augment::none(), ..SampleConfig::default() };
-    let stage = Stage1::new(folder, Some(Split::Train), config).expect("samples");
-    let count = stage.len();
-    measure(root, &Loader::new(stage, 1, 2, 2).shuffled(1), count);
-}
-
 fn main() {
-    let arguments: Vec<String> = std::env::args().collect();
-    if let Some(at) = arguments.iter().position(|argument| argument == "--data") {
-        println!("| samples | loaded | per second | peak memory |\n|---|---:|---:|---:|");
-        arguments[at + 1..].iter().filter(|argument| !argument.starts_with('-')).for_each(|root| pass(root));
-        return;
-    }
     let full = std::env::args().any(|argument| argument == "--full");
     let temporary = tempfile::tempdir().expect("temporary folder");
     let ours = SampleConfig::default();

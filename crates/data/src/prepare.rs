@@ -251,6 +251,10 @@ mod tests {
     use super::*;
     use crate::Jitter;
 
+    fn range(values: impl Iterator<Item = f64>) -> (f64, f64) {
+        values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)))
+    }
+
     #[test]
     fn without_jitter_the_cameras_are_the_published_ones() {
         let cameras = DataConfig::default().cameras(30.0, "a");
@@ -316,13 +320,10 @@ mod tests {
         let cameras = |name: &str| config.cameras(0.0, name);
         assert_eq!(cameras("a"), cameras("a"));
         assert_ne!(cameras("a"), cameras("b"));
-        let (mut nearest, mut furthest, mut shortest, mut longest) = (9.0_f64, 0.0_f64, 9.0_f64, 0.0_f64);
-        for camera in (0..40).flat_map(|i| cameras(&i.to_string())) {
-            let distance = (camera.centre() - Orbit::default().centre).length();
-            (nearest, furthest) = (nearest.min(distance), furthest.max(distance));
-            let focal = camera.focal.x / 1024.0;
-            (shortest, longest) = (shortest.min(focal), longest.max(focal));
-        }
+        let all: Vec<Camera> = (0..40).flat_map(|i| cameras(&i.to_string())).collect();
+        let distance = |camera: &Camera| (camera.centre() - Orbit::default().centre).length();
+        let (nearest, furthest) = range(all.iter().map(distance));
+        let (shortest, longest) = range(all.iter().map(|camera| camera.focal.x / 1024.0));
         assert!(nearest > 1.7 && furthest < 2.3 && furthest - nearest > 0.4, "{nearest} {furthest}");
         assert!(shortest >= 0.72 && longest <= 0.88 && longest - shortest > 0.15, "{shortest} {longest}");
         assert_eq!(config.refusal(), None);
@@ -335,33 +336,28 @@ mod tests {
     fn framed_cameras_see_persons_of_one_size_from_any_distance() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/data/phone.toml");
         let config = DataConfig::from_file(&path, &[]).expect("reads");
-        let (mut distances, mut pitches, mut sizes, mut places) =
-            (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let mut seen: Vec<[f64; 4]> = Vec::new();
         for name in 0..200 {
             for camera in config.cameras(0.0, &name.to_string()).chunks(4).flat_map(|four| [four[0], four[1]])
             {
                 let away = camera.centre() - Orbit::default().centre;
-                distances.push(away.length());
-                pitches.push((away.y / away.length()).asin().to_degrees());
-                let seen = |y: f64| {
+                let pitch = (away.y / away.length()).asin().to_degrees();
+                let at = |y: f64| {
                     let p = camera.world_to_camera.apply(glam::DVec3::new(0.0, y, 0.0));
                     (camera.focal * p.truncate() / p.z + camera.principal_point) / f64::from(camera.width)
                 };
-                sizes.push((seen(1.8) - seen(0.0)).length());
-                places.push((seen(0.9) - 0.5).abs().max_element());
+                let (size, place) = ((at(1.8) - at(0.0)).length(), (at(0.9) - 0.5).abs().max_element());
+                seen.push([away.length(), pitch, size, place]);
             }
         }
-        let range = |values: &mut Vec<f64>| {
-            values.sort_by(f64::total_cmp);
-            (values[0], values[values.len() - 1])
-        };
-        let (nearest, farthest) = range(&mut distances);
+        let of = |column: usize| range(seen.iter().map(|values| values[column]));
+        let (nearest, farthest) = of(0);
         assert!((1.55..1.8).contains(&nearest) && (3.8..4.05).contains(&farthest), "{nearest} {farthest}");
-        let (lowest, highest) = range(&mut pitches);
+        let (lowest, highest) = of(1);
         assert!((-6.5..-3.0).contains(&lowest) && (18.0..21.5).contains(&highest), "{lowest} {highest}");
-        let (smallest, largest) = range(&mut sizes);
+        let (smallest, largest) = of(2);
         assert!(smallest > 0.55 && largest < 0.9, "{smallest} {largest}");
-        let (_, farthest) = range(&mut places);
+        let (_, farthest) = of(3);
         assert!((0.05..0.2).contains(&farthest), "{farthest}");
     }
 }

@@ -1,7 +1,6 @@
 //! Scans of people: the collections' files and splits, and the normalisation of scans.
 
 use std::collections::HashSet;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::{Mat3, Vec3};
@@ -13,6 +12,7 @@ use crate::dataset::Split;
 use snapsnap_base::FileError;
 use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::{Mesh, MeshError};
+use snapsnap_people::files::entries;
 
 /// Height of a normalised subject in metres (docs/method.md, "Scans"). The real height is dropped on purpose: two
 /// photographs do not show it.
@@ -169,10 +169,7 @@ fn search(
     if !visited.insert(folder.canonicalize().unwrap_or_else(|_| folder.to_owned())) {
         return Ok(());
     }
-    let entries = fs::read_dir(folder).map_err(FileError::read(folder))?;
-    let entries = entries.map(|entry| entry.map(|entry| entry.path()));
-    let mut entries: Vec<PathBuf> = entries.collect::<Result<_, _>>().map_err(FileError::read(folder))?;
-    entries.sort_unstable();
+    let entries = entries(folder)?;
     let is_scan = |path: &Path| {
         let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
         path.is_file() && extension.is_some_and(|e| import::EXTENSIONS.contains(&e.as_str()))
@@ -183,10 +180,6 @@ fn search(
         return Ok(());
     }
     for path in entries {
-        // Some systems add hidden files to copied folders.
-        if path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.')) {
-            continue;
-        }
         if is_scan(&path) {
             found.push(path);
         } else if path.is_dir() && depth < MAX_DEPTH {
@@ -238,21 +231,14 @@ pub fn normalise(
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use rand::SeedableRng;
 
     use super::*;
 
     fn cloud(positions: &[[f32; 3]]) -> Mesh {
         Mesh { positions: positions.iter().map(|p| Vec3::from_array(*p)).collect(), ..Mesh::default() }
-    }
-
-    #[test]
-    fn the_lists_are_those_of_the_paper() {
-        let train = (0..526).filter(|id| Collection::Thuman20.split(&id.to_string(), 0) == Split::Train);
-        assert_eq!(train.count(), 426);
-        assert_eq!(VALIDATION.iter().collect::<HashSet<_>>().len(), 100);
-        assert_eq!(LOOSE.iter().collect::<HashSet<_>>().len(), 50);
-        assert!(LOOSE.iter().all(|id| (526..2500).contains(id)));
     }
 
     #[test]
@@ -297,25 +283,24 @@ mod tests {
 
     #[test]
     fn subjects_go_where_the_published_lists_say() {
+        let train = (0..526).filter(|id| Collection::Thuman20.split(&id.to_string(), 0) == Split::Train);
+        assert_eq!(train.count(), 426);
+        assert_eq!(LOOSE.iter().collect::<HashSet<_>>().len(), 50);
+        assert!(LOOSE.iter().all(|id| (526..2500).contains(id)));
         let collection = Collection::Thuman21;
         assert_eq!((collection.of("0525"), collection.of("0526")), (Collection::Thuman20, collection));
-        assert_eq!(Collection::Thuman20.split("0006", 7), Split::Val);
-        assert_eq!(Collection::Thuman20.split("0004", 7), Split::Train);
-        assert_eq!(collection.split("0659", 7), Split::Test);
-        assert_eq!(collection.split("0006", 7), Split::Val, "THuman2.1 includes THuman2.0");
-        assert_eq!(Collection::TwoK2K.split("0100", 99), Split::Test);
-        assert_eq!(Collection::TwoK2K.split("0101", 100), Split::Train);
-        assert_eq!(Collection::FourDDress.split("00185-f00021", 700), Split::Test);
-    }
-
-    #[test]
-    fn a_normalised_scan_stands_on_the_floor_at_its_height() {
-        let mut mesh = cloud(&[[0.2, -3.0, 0.1], [0.4, 9.0, -0.3]]);
-        normalise(&mut mesh, Collection::Thuman20, None).expect("has height");
-        let (low, high) = mesh.bounds();
-        assert!(low.y.abs() < 1e-6 && (high.y - 1.8).abs() < 1e-6);
-        // Not moved sideways, only scaled by 0.15.
-        assert!((mesh.positions[0] - Vec3::new(0.03, 0.0, 0.015)).length() < 1e-6, "{mesh:?}");
+        for (collection, subject, place, split) in [
+            (Collection::Thuman20, "0006", 7, Split::Val),
+            (Collection::Thuman20, "0004", 7, Split::Train),
+            (collection, "0659", 7, Split::Test),
+            // THuman2.1 includes THuman2.0.
+            (collection, "0006", 7, Split::Val),
+            (Collection::TwoK2K, "0100", 99, Split::Test),
+            (Collection::TwoK2K, "0101", 100, Split::Train),
+            (Collection::FourDDress, "00185-f00021", 700, Split::Test),
+        ] {
+            assert_eq!(collection.split(subject, place), split, "{collection:?} {subject}");
+        }
     }
 
     #[test]
@@ -326,15 +311,23 @@ mod tests {
         }
     }
 
+    /// Feet on the floor, and a height of 1.8 m.
     #[test]
-    fn sets_with_other_axes_and_places_are_turned_and_centred() {
+    fn normalised_scans_have_the_places_and_axes_of_their_sets() {
+        let normalised = |positions: &[[f32; 3]], collection: Collection| {
+            let mut mesh = cloud(positions);
+            normalise(&mut mesh, collection, None).expect("has height");
+            mesh.positions
+        };
+        // Not moved sideways, only scaled by 0.15.
+        let [low, high] = [Vec3::new(0.03, 0.0, 0.015), Vec3::new(0.06, 1.8, -0.045)];
+        let found = normalised(&[[0.2, -3.0, 0.1], [0.4, 9.0, -0.3]], Collection::Thuman20);
+        assert!((found[0] - low).length() < 1e-6 && (found[1] - high).length() < 1e-6, "{found:?}");
         // M·(a, b, c) = (−b, c, −a): height runs along the third axis.
-        let mut mesh = cloud(&[[1.0, 2.0, 0.0], [1.0, 2.0, 3.6]]);
-        normalise(&mut mesh, Collection::Thuman21, None).expect("has height");
-        assert!((mesh.positions[1] - Vec3::new(-1.0, 1.8, -0.5)).length() < 1e-6, "{mesh:?}");
-        let mut mesh = cloud(&[[5.0, 0.0, 7.0], [5.4, 1.8, 7.2], [5.2, 0.9, 7.4]]);
-        normalise(&mut mesh, Collection::TwoK2K, None).expect("has height");
-        let mean = mesh.positions.iter().sum::<Vec3>() / 3.0;
+        let found = normalised(&[[1.0, 2.0, 0.0], [1.0, 2.0, 3.6]], Collection::Thuman21);
+        assert!((found[1] - Vec3::new(-1.0, 1.8, -0.5)).length() < 1e-6, "{found:?}");
+        let found = normalised(&[[5.0, 0.0, 7.0], [5.4, 1.8, 7.2], [5.2, 0.9, 7.4]], Collection::TwoK2K);
+        let mean = found.iter().sum::<Vec3>() / 3.0;
         assert!(mean.x.abs() < 1e-5 && mean.z.abs() < 1e-5);
     }
 

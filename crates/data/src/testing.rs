@@ -44,6 +44,16 @@ pub fn block() -> Mesh {
     mesh(positions, sides, Vec3::new(0.3, 0.6, 0.8))
 }
 
+/// A block, and another one that `change` moves and scales.
+pub fn two_blocks(change: impl Fn(Vec3) -> Vec3) -> Mesh {
+    let (mut mesh, other) = (block(), block());
+    let first = mesh.positions.len() as u32;
+    mesh.positions.extend(other.positions.into_iter().map(change));
+    mesh.faces
+        .extend(other.faces.iter().map(|f| Face { positions: f.positions.map(|row| row + first), ..*f }));
+    mesh
+}
+
 /// A mesh of one colour, made of quadrilaterals.
 fn mesh<const N: usize>(positions: Vec<Vec3>, faces: [[u32; 4]; N], color: Vec3) -> Mesh {
     let faces = faces.into_iter().flat_map(|[a, b, c, d]| [[a, b, c], [a, c, d]]);

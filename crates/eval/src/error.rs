@@ -1,7 +1,6 @@
 //! Errors of comparisons.
 
 use snapsnap_base::FileError;
-use snapsnap_base::config::ConfigError;
 use snapsnap_net::weights::WeightsError;
 use snapsnap_splat::SplatError;
 
@@ -17,9 +16,6 @@ pub enum EvalError {
     /// Error of weights.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// Error of a config.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
     /// Error of a render.
     #[error(transparent)]
     Splat(#[from] SplatError),

@@ -6,6 +6,8 @@ use image::{DynamicImage, RgbImage};
 use rayon::prelude::*;
 
 use crate::EvalError;
+use crate::preview::picture;
+use crate::region::Region;
 
 /// One picture.
 #[derive(Debug, Clone, PartialEq)]
@@ -83,11 +85,6 @@ impl Picture {
         Tensor::from_data(TensorData::new(self.values.clone(), [1, 3, self.height, self.width]), device)
     }
 
-    /// The three planes `[3, H, W]`.
-    pub fn values(&self) -> &[f32] {
-        &self.values
-    }
-
     /// One of the three planes `[H, W]`.
     pub fn plane(&self, channel: usize) -> &[f32] {
         &self.values[channel * self.height * self.width..][..self.height * self.width]
@@ -104,20 +101,20 @@ impl Picture {
         Self { width, height, values: lines.flat_map(|(c, row)| line(c, row)).copied().collect() }
     }
 
-    /// The picture with black pixels outside of the mask `inside` `[H, W]`.
-    pub fn only(mut self, inside: &[bool]) -> Self {
-        for plane in self.values.chunks_exact_mut(inside.len().max(1)) {
-            plane.iter_mut().zip(inside).filter(|(_, set)| !**set).for_each(|(v, _)| *v = 0.0);
+    /// The box of a region, with black pixels outside of the region's mask.
+    pub fn within(&self, region: &Region) -> Self {
+        let mut part = self.cropped(region.window);
+        if let Some(inside) = &region.inside {
+            for plane in part.values.chunks_exact_mut(inside.len().max(1)) {
+                plane.iter_mut().zip(inside).filter(|(_, set)| !**set).for_each(|(v, _)| *v = 0.0);
+            }
         }
-        self
+        part
     }
 
     /// The picture with 8 bits per channel.
     pub fn to_rgb8(&self) -> RgbImage {
-        RgbImage::from_fn(self.width as u32, self.height as u32, |x, y| {
-            let at = y as usize * self.width + x as usize;
-            image::Rgb([0, 1, 2].map(|c| (self.plane(c)[at] * 255.0).round() as u8))
-        })
+        picture([self.width, self.height], |i| [0, 1, 2].map(|c| self.plane(c)[i]))
     }
 }
 
@@ -132,19 +129,12 @@ mod tests {
 
     #[test]
     fn eight_and_sixteen_bits_and_floats_of_one_picture_are_equal() {
-        let eight = colorful();
-        let sixteen =
-            ImageBuffer::from_fn(5, 4, |x, y| Rgb(eight.get_pixel(x, y).0.map(|v| u16::from(v) * 257)));
-        let float =
-            ImageBuffer::from_fn(5, 4, |x, y| Rgb(eight.get_pixel(x, y).0.map(|v| f32::from(v) / 255.0)));
-        let [expected, others @ ..] = [
-            DynamicImage::ImageRgb32F(float),
-            DynamicImage::ImageRgb16(sixteen),
-            DynamicImage::ImageRgb8(eight),
-        ]
-        .map(|picture| Picture::from_file(picture, "picture").expect("a picture"));
+        let eight = DynamicImage::ImageRgb8(colorful());
+        let files: [DynamicImage; 3] = [eight.to_rgb32f().into(), eight.to_rgb16().into(), eight];
+        let [expected, others @ ..] =
+            files.map(|picture| Picture::from_file(picture, "picture").expect("a picture"));
         assert_eq!(others, [expected.clone(), expected.clone()]);
-        assert_eq!(snapsnap_ops::host(expected.tensor(&Device::flex())), expected.values());
+        assert_eq!(snapsnap_ops::host(expected.tensor(&Device::flex())), expected.values);
         assert_eq!(expected.to_rgb8(), colorful());
         // Red is the first plane.
         assert_eq!(expected.plane(0)[3], 120.0 / 255.0);
@@ -167,7 +157,7 @@ mod tests {
         let rgba = ImageBuffer::from_pixel(1, 1, Rgba([200_u8, 100, 50, 51]));
         let picture = Picture::from_file(DynamicImage::ImageRgba8(rgba), "picture").expect("a picture");
         let expected = [200.0, 100.0, 50.0].map(|v: f32| v / 255.0 * 0.2);
-        assert!(picture.values().iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-7), "{picture:?}");
+        assert!(picture.values.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-7), "{picture:?}");
     }
 
     #[test]
@@ -175,7 +165,7 @@ mod tests {
         let values: Vec<f32> = (0..48).map(|i| i as f32 / 48.0).collect();
         let picture = Picture::new(values, [4, 4], "picture").expect("a picture");
         let crop = picture.cropped([1, 2, 2, 1]);
-        assert_eq!(crop.values(), [9.0, 10.0, 25.0, 26.0, 41.0, 42.0].map(|v| v / 48.0));
+        assert_eq!(crop.values, [9.0, 10.0, 25.0, 26.0, 41.0, 42.0].map(|v| v / 48.0));
         // A render has interleaved colours. Values over 1 are clamped before the mean.
         let render: Vec<f32> = (0..16).flat_map(|i| [0.0, if i == 6 { 9.0 } else { 0.5 }, 0.0]).collect();
         let half = Picture::rendered(&render, [4, 4], 2).expect("a picture");

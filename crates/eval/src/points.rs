@@ -56,17 +56,12 @@ pub fn point_errors(pairs: &[Pair]) -> Vec<PointError> {
     pairs.iter().filter_map(error).collect()
 }
 
-/// Largest side in metres of a triangle of neighbouring pixels on one surface: six pixel widths, on a canvas whose
-/// rows have `side` pixels. Longer sides are depth steps. The nominal cameras' focal length is 0.8 of the canvas, and
-/// the person is two metres away.
-pub fn longest_side(side: usize) -> f64 {
-    6.0 * 2.0 / (0.8 * side as f64)
-}
-
 /// Mean angle in degrees between normals of predicted and true points, on a canvas whose rows have `side` pixels. Each
 /// normal is of the triangle of a pixel, its right and its lower neighbour. `None` without a triangle on one surface.
 pub fn normal_error(pair: &Pair, side: usize) -> Option<f64> {
-    let longest = longest_side(side);
+    // Six pixel widths: longer sides are depth steps. The nominal cameras' focal length is 0.8 of the canvas, and the
+    // person is two metres away.
+    let longest = 6.0 * 2.0 / (0.8 * side as f64);
     let (points, truth) = (pair.points.as_chunks().0, pair.truth.as_chunks().0);
     let is_there = |i: usize| {
         pair.valid.get(i).is_some_and(|valid| *valid > 0.5) && points.get(i).is_some_and(is_predicted)

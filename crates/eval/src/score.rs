@@ -1,8 +1,7 @@
 //! All metrics of a picture and its ground truth.
 
-use burn::tensor::Device;
 use burn::tensor::ops::PadMode;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::EvalError;
 use crate::lpips::{Lpips, MIN_SIDE};
@@ -12,7 +11,7 @@ use crate::similarity::{psnr, ssim};
 use crate::statistics::mean;
 
 /// Metrics of a view, or their means.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Score {
     /// dB; ∞ for equal pictures.
     #[serde(with = "crate::statistics::number")]
@@ -36,19 +35,12 @@ impl Score {
         lpips: Option<&Lpips>,
     ) -> Result<Self, EvalError> {
         let (psnr, ssim) = (psnr(image, target, region)?, ssim(image, target, region)?);
-        let visible = |picture: &Picture| {
-            let part = picture.cropped(region.window);
-            match &region.inside {
-                Some(inside) => part.only(inside),
-                None => part,
-            }
-        };
         let [.., width, height] = region.window;
         let short = [width, height].map(|side| MIN_SIDE.saturating_sub(side));
         let lpips = lpips.filter(|_| short == [0, 0] || region.inside.is_some()).map(|network| {
-            let device: &Device = &network.device();
-            let tensor = |picture| {
-                visible(picture).tensor(device).pad((0, short[0], 0, short[1]), PadMode::Constant(0.0))
+            let tensor = |picture: &Picture| {
+                let part = picture.within(region).tensor(&network.device());
+                part.pad((0, short[0], 0, short[1]), PadMode::Constant(0.0))
             };
             let distance = network.distance(tensor(image), tensor(target));
             f64::from(snapsnap_ops::host(distance)[0])

@@ -179,13 +179,12 @@ fn line_of(a: &[f32], b: &[f32], [height, width]: [usize; 2], y: usize, window: 
 /// Structural similarity `[B,C,H,W]` of every pixel and channel of pictures `[B,C,H,W]` with values in [0, 1], for the
 /// loss of stage 2: an 11×11 Gaussian window of σ = 1.5, zero padding, population variances. Differentiable.
 pub fn ssim_gaussian(x: Tensor<4>, y: Tensor<4>) -> Tensor<4> {
-    let mean = |t: Tensor<4>| blur(t);
-    let (mx, my) = (mean(x.clone()), mean(y.clone()));
+    let (mx, my) = (blur(x.clone()), blur(y.clone()));
     let (mxx, myy, mxy) = (mx.clone().square(), my.clone().square(), mx * my);
     // E[x²] − E[x]² is negative by rounding where a picture is flat. The similarity would exceed 1.
-    let variance = |t: Tensor<4>, m: &Tensor<4>| (mean(t.square()) - m.clone()).clamp_min(0.0);
+    let variance = |t: Tensor<4>, m: &Tensor<4>| (blur(t.square()) - m.clone()).clamp_min(0.0);
     let (vx, vy) = (variance(x.clone(), &mxx), variance(y.clone(), &myy));
-    let covariance = mean(x * y) - mxy.clone();
+    let covariance = blur(x * y) - mxy.clone();
     let numerator = (mxy * 2.0 + C1) * (covariance * 2.0 + C2);
     numerator / ((mxx + myy + C1) * (vx + vy + C2))
 }

@@ -130,9 +130,7 @@ mod tests {
         assert_eq!(interval(&[3.0]), Some(Interval { mean: 3.0, low: 3.0, high: 3.0 }));
         assert_eq!(interval(&[]), None);
         let endless = interval(&[f64::INFINITY, f64::INFINITY]).expect("people");
-        assert_eq!(
-            serde_json::to_string(&endless).expect("JSON"),
-            r#"{"mean":"inf","low":"inf","high":"inf"}"#
-        );
+        let text = serde_json::to_string(&endless).expect("JSON");
+        assert_eq!(text, r#"{"mean":"inf","low":"inf","high":"inf"}"#);
     }
 }

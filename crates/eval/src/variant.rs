@@ -106,6 +106,6 @@ pub(crate) fn views_problem(inputs: &[usize]) -> Option<String> {
 }
 
 /// Whether a list contains an entry twice.
-pub(crate) fn names_twice(views: &[usize]) -> bool {
-    views.iter().collect::<BTreeSet<_>>().len() < views.len()
+pub(crate) fn names_twice<T: Ord>(list: &[T]) -> bool {
+    list.iter().collect::<BTreeSet<_>>().len() < list.len()
 }

@@ -144,8 +144,7 @@ impl<'a> Renderer<'a> {
             Light::Plain(lights) => Lit::Plain(lights),
             Light::Around(surroundings) => Lit::Vertices(self.occlusion().light(surroundings, &self.normals)),
         };
-        let Self { mesh, normals, textures, .. } = self;
-        let shader = Shader { mesh, normals, textures, camera, corners: &corners, light };
+        let shader = Shader { renderer: self, camera, corners: &corners, light };
         let pixels = width * height;
         let mut view = View {
             width,
@@ -248,22 +247,18 @@ impl Band {
         let columns = || list.iter().map(|index| triangles[*index as usize].columns);
         let left = columns().map(|[first, _]| first).min()?;
         let columns = columns().map(|[_, last]| last).max()? + 1 - left;
-        let nearest = vec![(0.0, NONE); (rows[1] - rows[0]) * columns * places.len()];
-        let mut band = Self { left, columns, nearest };
-        list.iter().for_each(|index| band.add(*index, &triangles[*index as usize], rows, places));
-        Some(band)
-    }
-
-    /// Depth test of the samples inside a triangle.
-    fn add(&mut self, index: u32, t: &Triangle, rows: [usize; 2], places: &[[i64; 2]]) {
-        let (left, columns) = (self.left, self.columns);
-        t.samples(rows, places, |x, y, place, inverse_depth| {
-            let pixel = (y - rows[0]) * columns + x - left;
-            let nearest = &mut self.nearest[pixel * places.len() + place];
-            if inverse_depth > nearest.0 {
-                *nearest = (inverse_depth, index);
-            }
-        });
+        let mut nearest = vec![(0.0, NONE); (rows[1] - rows[0]) * columns * places.len()];
+        for &index in list {
+            // Depth test of the samples inside the triangle.
+            triangles[index as usize].samples(rows, places, |x, y, place, inverse_depth| {
+                let pixel = (y - rows[0]) * columns + x - left;
+                let nearest = &mut nearest[pixel * places.len() + place];
+                if inverse_depth > nearest.0 {
+                    *nearest = (inverse_depth, index);
+                }
+            });
+        }
+        Some(Self { left, columns, nearest })
     }
 
     /// Writes [`View::second`] of the band's rows to `to`, whose rows have `width` pixels.

@@ -200,11 +200,6 @@ impl NetworkConfig {
     pub fn hull_reach(&self) -> f64 {
         if self.hull_margin.is_some() { self.hull_reach } else { 0.0 }
     }
-
-    /// Channels of the four token maps that feed the DPT branches.
-    pub fn hook_widths(&self) -> [usize; 4] {
-        self.hooks.map(|hook| if hook == 0 { self.enc_dim } else { self.dec_dim })
-    }
 }
 
 /// Size of the Gaussian regressor.

@@ -16,7 +16,7 @@ pub use crate::nearest_colors::side_images;
 use crate::network::{View, nominal_camera};
 use crate::photograph::Photograph;
 use crate::points::Points;
-use crate::regressor::{Attributes, FEATURES, Geometry, Limits, Regressor, Statistics};
+use crate::regressor::{Attributes, FEATURES, Geometry, Limits, Regressor};
 use crate::steps::{Record, Step};
 use crate::valid_pixels::Chosen;
 use crate::window::Window;
@@ -217,7 +217,7 @@ fn regress(
     let colors = Tensor::<4>::from_data(TensorData::new(colors, [views.len(), 3, h, w]), &device);
     let points = maps.narrow(1, window.rows.start, h).narrow(2, window.columns.start, w);
     let input = Tensor::cat(vec![colors, points.clone().permute([0, 3, 1, 2])], 1);
-    let features = network.forward(input, &mut Statistics::measured());
+    let features = network.forward(input);
     let mut parts = Vec::new();
     for (i, view) in views.iter().enumerate() {
         let rows = window.indices(view.valid, side);

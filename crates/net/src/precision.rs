@@ -16,7 +16,7 @@ impl Precision {
     /// The precision of a reconstruction for which none is asked: the training's on a CPU with instructions for bf16,
     /// f32 elsewhere.
     pub fn of_weights(config: &Config, device: &Device) -> Self {
-        let is_fast = *device == Device::flex() && cpu_has_bf16();
+        let is_fast = *device == Device::flex() && snapsnap_ops::bf16::is_there();
         if is_fast { config.network.precision } else { Self::F32 }
     }
 
@@ -29,11 +29,6 @@ impl Precision {
         let is_last = predictor.is_last_layer();
         map_named(predictor, "", &mut Lower { dtype: self.dtype(), is_last })
     }
-}
-
-/// Whether this processor has instructions for products in bf16.
-pub fn cpu_has_bf16() -> bool {
-    snapsnap_ops::bf16::is_there()
 }
 
 struct Lower {

@@ -1,8 +1,9 @@
 //! Which pixels become Gaussians.
 
+use glam::Vec3;
+
 use crate::config::{Config, RegressorStart};
 use crate::hull::Hull;
-use crate::nearest_colors::is_finite;
 use crate::network::pixel_width;
 use crate::points::Points;
 
@@ -43,7 +44,7 @@ impl Chosen {
                 return false;
             }
             let point = [points[3 * at], points[3 * at + 1], points[3 * at + 2]];
-            if !is_finite(&point) {
+            if !Vec3::from(point).is_finite() {
                 lost += 1;
                 return false;
             }
@@ -67,13 +68,11 @@ impl Chosen {
 /// `steepest` times the width of a pixel at the person's distance. Returns the number of these pixels.
 pub(crate) fn without_steep(valid: &mut [bool], points: &[f32], side: usize, steepest: f32) -> usize {
     let farthest = (steepest * pixel_width(side)).powi(2);
-    let squared = |i: usize, j: usize| -> f32 {
-        (0..3).map(|axis| (points[3 * i + axis] - points[3 * j + axis]).powi(2)).sum()
-    };
+    let point = |i: usize| Vec3::from_slice(&points[3 * i..]);
     let mut steep = vec![false; valid.len()];
     for i in (0..valid.len()).filter(|&i| valid[i]) {
         for j in [(i % side + 1 < side).then_some(i + 1), Some(i + side)].into_iter().flatten() {
-            if valid.get(j) == Some(&true) && squared(i, j) > farthest {
+            if valid.get(j) == Some(&true) && point(i).distance_squared(point(j)) > farthest {
                 (steep[i], steep[j]) = (true, true);
             }
         }

@@ -28,17 +28,12 @@ impl Window {
 
     /// The tight box around all set pixels of the masks `[side, side]`; `None` if none is set.
     pub fn around<'a>(masks: impl Iterator<Item = &'a [bool]>, side: usize) -> Option<Self> {
-        let mut found: Option<Self> = None;
-        for mask in masks {
-            for (row, line) in mask.chunks_exact(side).enumerate() {
-                let Some(first) = line.iter().position(|v| *v) else { continue };
-                let last = line.iter().rposition(|v| *v).expect("there is a first");
-                let window = found.get_or_insert(Self { rows: row..row + 1, columns: first..last + 1 });
-                window.rows = window.rows.start.min(row)..window.rows.end.max(row + 1);
-                window.columns = window.columns.start.min(first)..window.columns.end.max(last + 1);
-            }
-        }
-        found
+        let lines = masks.flat_map(|mask| mask.chunks_exact(side).enumerate());
+        let boxes = lines.filter_map(|(row, line)| {
+            let (first, last) = (line.iter().position(|v| *v)?, line.iter().rposition(|v| *v)?);
+            Some(Self { rows: row..row + 1, columns: first..last + 1 })
+        });
+        boxes.reduce(|all, line| all.united(&line))
     }
 
     /// The tight box around the person in photographs with these masks `[.., side, side]`: every pixel above 0.

@@ -1,5 +1,3 @@
-#![allow(deprecated, reason = "NdArray is the CPU test backend")]
-
 //! A gather of a table's rows with a faster gradient, for GPUs. Burn scatters the rows' gradients with one thread per
 //! column. Here each row is taken once at most, so the gradient is a gather, too.
 
@@ -10,36 +8,31 @@ use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::Checkpoi
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::{FloatTensor, IntTensor};
-use burn::backend::{Backend, Dispatch, ExtensionType, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Backend, Dispatch, Flex, TensorMetadata, backend_extension};
 use burn::tensor::{Int, Shape, Tensor, TensorData};
 use burn_cubecl::CubeBackend;
 
 use crate::device::is_tracked_on_gpu;
-
-/// A table `[N, C]`, or rows of a table.
-#[derive(ExtensionType, Clone, Debug)]
-pub struct Table<B: Backend> {
-    values: FloatTensor<B>,
-}
+use crate::op::One;
 
 /// Backends with the operation.
-#[backend_extension(Cube, Flex, NdArray, Autodiff)]
+#[backend_extension(Cube, Flex, Autodiff)]
 pub trait RowsBackend: Backend {
-    /// The table's `rows` `[M, C]`.
-    fn take(#[extension_type] table: Table<Self>, rows: Arc<[i32]>) -> Table<Self>;
+    /// The `rows` `[M, C]` of a table `[N, C]`.
+    fn take(#[extension_type] table: One<Self>, rows: Arc<[i32]>) -> One<Self>;
 }
 
 macro_rules! untracked {
     ($($backend:ty),+) => {
         $(impl RowsBackend for $backend {
-            fn take(table: Table<Self>, rows: Arc<[i32]>) -> Table<Self> {
-                Table { values: select::<Self>(table.values, &rows) }
+            fn take(table: One<Self>, rows: Arc<[i32]>) -> One<Self> {
+                One { tensor: select::<Self>(table.tensor, &rows) }
             }
         })+
     };
 }
 
-untracked!(CubeBackend, Flex, NdArray);
+untracked!(CubeBackend, Flex);
 
 fn select<B: Backend>(table: FloatTensor<B>, rows: &[i32]) -> FloatTensor<B> {
     let device = table.device();
@@ -70,16 +63,16 @@ impl<B: Backend> Backward<B, 1> for RowsBackward {
 }
 
 impl<B: RowsBackend, C: CheckpointStrategy> RowsBackend for Autodiff<B, C> {
-    fn take(Table { values }: Table<Self>, rows: Arc<[i32]>) -> Table<Self> {
-        let shape = values.shape();
-        let values = match RowsBackward.prepare::<C>([values.node()]).compute_bound().stateful() {
+    fn take(One { tensor }: One<Self>, rows: Arc<[i32]>) -> One<Self> {
+        let shape = tensor.shape();
+        let tensor = match RowsBackward.prepare::<C>([tensor.node()]).compute_bound().stateful() {
             OpsKind::Tracked(prepared) => {
-                let taken = select::<B>(values.into_primitive(), &rows);
+                let taken = select::<B>(tensor.into_primitive(), &rows);
                 prepared.finish((rows, shape), taken)
             }
-            OpsKind::UnTracked(prepared) => prepared.finish(select::<B>(values.into_primitive(), &rows)),
+            OpsKind::UnTracked(prepared) => prepared.finish(select::<B>(tensor.into_primitive(), &rows)),
         };
-        Table { values }
+        One { tensor }
     }
 }
 
@@ -115,8 +108,8 @@ fn selected(table: Tensor<2>, rows: &[i32]) -> Tensor<2> {
 }
 
 fn taken_once(table: Tensor<2>, rows: &[i32]) -> Tensor<2> {
-    let table = Table { values: table.into_dispatch() };
-    Tensor::from_dispatch(<Dispatch as RowsBackend>::take(table, rows.into()).values)
+    let table = One { tensor: table.into_dispatch() };
+    Tensor::from_dispatch(<Dispatch as RowsBackend>::take(table, rows.into()).tensor)
 }
 
 #[cfg(test)]

@@ -1,5 +1,3 @@
-#![allow(deprecated, reason = "NdArray is the CPU test backend")]
-
 //! Burn's convolution with a faster gradient of the weight, for GPUs. Without autotuning, Burn computes this gradient
 //! as a convolution whose kernel is the whole image: one thread per weight, with a loop over all pixels of all images.
 //! Here it is im2col and a matrix product: `[D, pixels]` times `[pixels, taps · C]`.
@@ -10,10 +8,12 @@ use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::Checkpoi
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Backend, Dispatch, ExtensionType, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Backend, Dispatch, ExtensionType, Flex, TensorMetadata, backend_extension};
 use burn::tensor::ops::ConvOptions;
 use burn::tensor::{DType, FloatDType, Shape, Slice, Tensor};
 use burn_cubecl::CubeBackend;
+
+use crate::op::One;
 
 /// Most pixels that one matrix product sums over. Several products run at once, and their results are added.
 const PIXELS: usize = 512;
@@ -27,30 +27,24 @@ pub struct Operands<B: Backend> {
     weight: FloatTensor<B>,
 }
 
-/// An image `[B, D, ⌈H / stride⌉, ⌈W / stride⌉]`.
-#[derive(ExtensionType, Clone, Debug)]
-pub struct Image<B: Backend> {
-    image: FloatTensor<B>,
-}
-
 /// Backends with the operation.
-#[backend_extension(Cube, Flex, NdArray, Autodiff)]
+#[backend_extension(Cube, Flex, Autodiff)]
 pub trait ConvolutionBackend: Backend {
-    /// A convolution with zero padding of half a kernel.
-    fn convolve(#[extension_type] operands: Operands<Self>, stride: usize) -> Image<Self>;
+    /// A convolution with zero padding of half a kernel: an image `[B, D, ⌈H / stride⌉, ⌈W / stride⌉]`.
+    fn convolve(#[extension_type] operands: Operands<Self>, stride: usize) -> One<Self>;
 }
 
 macro_rules! untracked {
     ($($backend:ty),+) => {
         $(impl ConvolutionBackend for $backend {
-            fn convolve(operands: Operands<Self>, stride: usize) -> Image<Self> {
-                Image { image: forward::<Self>(operands, stride) }
+            fn convolve(Operands { x, weight }: Operands<Self>, stride: usize) -> One<Self> {
+                One { tensor: forward::<Self>(x, weight, stride) }
             }
         })+
     };
 }
 
-untracked!(CubeBackend, Flex, NdArray);
+untracked!(CubeBackend, Flex);
 
 #[derive(Debug)]
 struct ConvolutionBackward;
@@ -76,30 +70,28 @@ impl<B: Backend> Backward<B, 2> for ConvolutionBackward {
 }
 
 impl<B: ConvolutionBackend, C: CheckpointStrategy> ConvolutionBackend for Autodiff<B, C> {
-    fn convolve(Operands { x, weight }: Operands<Self>, stride: usize) -> Image<Self> {
+    fn convolve(Operands { x, weight }: Operands<Self>, stride: usize) -> One<Self> {
         let prepared = ConvolutionBackward.prepare::<C>([x.node(), weight.node()]).compute_bound().stateful();
-        let image = match prepared {
+        let tensor = match prepared {
             OpsKind::Tracked(mut prepared) => {
                 let kept = (prepared.checkpoint(&x), prepared.checkpoint(&weight), stride);
-                let operands = Operands { x: x.into_primitive(), weight: weight.into_primitive() };
-                prepared.finish(kept, forward::<B>(operands, stride))
+                prepared.finish(kept, forward::<B>(x.into_primitive(), weight.into_primitive(), stride))
             }
             OpsKind::UnTracked(prepared) => {
-                let operands = Operands { x: x.into_primitive(), weight: weight.into_primitive() };
-                prepared.finish(forward::<B>(operands, stride))
+                prepared.finish(forward::<B>(x.into_primitive(), weight.into_primitive(), stride))
             }
         };
-        Image { image }
+        One { tensor }
     }
 }
 
 /// The convolution of an image `[B, C, H, W]` with a weight `[D, C, K, K]`, K odd, and zero padding of K / 2.
 pub fn convolve(x: Tensor<4>, weight: Tensor<4>, stride: usize) -> Tensor<4> {
     let operands = Operands { x: x.into_dispatch(), weight: weight.into_dispatch() };
-    Tensor::from_dispatch(<Dispatch as ConvolutionBackend>::convolve(operands, stride).image)
+    Tensor::from_dispatch(<Dispatch as ConvolutionBackend>::convolve(operands, stride).tensor)
 }
 
-fn forward<B: Backend>(Operands { x, weight }: Operands<B>, stride: usize) -> FloatTensor<B> {
+fn forward<B: Backend>(x: FloatTensor<B>, weight: FloatTensor<B>, stride: usize) -> FloatTensor<B> {
     let options = options(weight.shape()[2], stride);
     B::conv2d(x, weight, None, options)
 }

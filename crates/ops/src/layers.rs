@@ -15,7 +15,7 @@ use burn::tensor::{FloatDType, Tensor};
 
 use crate::device::{has_kernels, in_f32, is_bf16, is_tracked_on_gpu};
 use crate::gpu_convolution::convolve;
-use crate::op::{self, Kept, Kernel};
+use crate::op::{self, InputGradients, Kept, Kernel};
 use crate::operators::{Conv1x1, Conv3x3, Layer, LayerNorm, Linear, Unfolded, Wanted};
 
 /// A linear layer: `[B, N, inputs]` → `[B, N, outputs]`.
@@ -48,8 +48,8 @@ pub fn linear_gelu(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
 }
 
 fn linear_on_flex(layer: &nn::Linear, x: Tensor<3>, gelu: bool) -> Tensor<3> {
-    let ([b, n, _], [inputs, outputs], half) = (x.dims(), layer.weight.dims(), is_bf16(&layer.weight));
-    let sizes = Linear { rows: b * n, inputs, outputs, transposed: false, half, gelu };
+    let ([b, n, _], [inputs, outputs], in_bf16) = (x.dims(), layer.weight.dims(), is_bf16(&layer.weight));
+    let sizes = Linear { rows: b * n, inputs, outputs, transposed: false, in_bf16, gelu };
     run(sizes, [b, n, outputs], x, layer.weight.val(), bias(&layer.bias))
 }
 
@@ -80,7 +80,7 @@ fn normalised(x: Tensor<3>, epsilon: f64, [weight, bias]: [Tensor<3>; 2]) -> Ten
 pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
     let ([batch, inputs, height, width], [outputs, _, rows, columns]) = (x.dims(), layer.weight.dims());
     let (weight, bias) = (layer.weight.val(), bias(&layer.bias));
-    let half = is_bf16(&layer.weight);
+    let in_bf16 = is_bf16(&layer.weight);
     let is_plain = layer.groups == 1 && layer.dilation == [1, 1];
     let [down, across] = layer.stride;
     if is_plain && rows == columns && rows % 2 == 1 && down == across && is_tracked_on_gpu(&x) {
@@ -104,7 +104,7 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
             run(sizes, [batch, outputs, height.div_ceil(2), width.div_ceil(2)], x, weight, bias)
         }
         (true, [1, 1], [1, 1]) => {
-            let sizes = Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified, half };
+            let sizes = Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified, in_bf16 };
             run(sizes, [batch, outputs, height, width], x, weight, bias)
         }
         _ => {
@@ -127,14 +127,10 @@ pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
     let weight: Tensor<2> = layer.weight.val().reshape([inputs, squares]).transpose();
     let bias =
         layer.bias.as_ref().map(|bias| bias.val().reshape([outputs, 1]).repeat_dim(1, s * s).flatten(0, 1));
-    let (pixels, half) = (height * width, is_bf16(&layer.weight));
-    let sizes = Conv1x1 { batch, inputs, outputs: squares, pixels, rectified: false, half };
-    run(sizes, [batch, outputs, s, s, height, width], x, weight, bias).permute([0, 1, 4, 2, 5, 3]).reshape([
-        batch,
-        outputs,
-        s * height,
-        s * width,
-    ])
+    let (pixels, in_bf16) = (height * width, is_bf16(&layer.weight));
+    let sizes = Conv1x1 { batch, inputs, outputs: squares, pixels, rectified: false, in_bf16 };
+    let enlarged = run(sizes, [batch, outputs, s, s, height, width], x, weight, bias);
+    enlarged.permute([0, 1, 4, 2, 5, 3]).reshape([batch, outputs, s * height, s * width])
 }
 
 /// A convolution whose kernel is as large as its stride: images `[B, C, H, W]` → tokens `[B, H/side · W/side, D]`,
@@ -147,8 +143,9 @@ pub fn patches(layer: &Conv2d, x: Tensor<4>) -> Tensor<3> {
     assert_eq!(layer.stride, [side; 2], "the kernel is as large as the stride");
     let (rows, columns, inputs) = (height / side, width / side, channels * side * side);
     let patches = x.reshape([batch, channels, rows, side, columns, side]).permute([0, 2, 4, 1, 3, 5]);
-    let half = is_bf16(&layer.weight);
-    let sizes = Linear { rows: batch * rows * columns, inputs, outputs, transposed: true, half, gelu: false };
+    let in_bf16 = is_bf16(&layer.weight);
+    let sizes =
+        Linear { rows: batch * rows * columns, inputs, outputs, transposed: true, in_bf16, gelu: false };
     let x: Tensor<2> = patches.reshape([sizes.rows, inputs]);
     run(sizes, [batch, rows * columns, outputs], x, layer.weight.val(), bias(&layer.bias))
 }
@@ -172,8 +169,7 @@ impl<L: Layer> Kernel for Operator<L> {
 
     fn forward(&self, [x, weight, bias]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let (out, kept) = self.layer.forward(x, weight, self.has_bias.then_some(bias), keep);
-        let kept: Kept = if keep { Some(Box::new(kept)) } else { None };
-        (out, kept)
+        (out, keep.then(|| Box::new(kept) as _))
     }
 
     fn backward(
@@ -182,7 +178,7 @@ impl<L: Layer> Kernel for Operator<L> {
         kept: Kept,
         upstream: &[f32],
         [of_input, of_weight, of_bias]: [bool; 3],
-    ) -> [Option<Vec<f32>>; 3] {
+    ) -> InputGradients {
         let kept = kept.and_then(|kept| kept.downcast::<L::Kept>().ok()).expect("kept by the forward pass");
         let wanted = Wanted { input: of_input, weight: of_weight, bias: of_bias && self.has_bias };
         let gradients = self.layer.backward(x, weight, *kept, upstream, wanted);

@@ -19,6 +19,7 @@ pub mod regressor;
 mod resize;
 mod rope;
 mod rotary;
+mod vectors;
 mod winograd;
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use burn::tensor::Tensor;
 use rayon::prelude::*;
 
 use crate::device::has_kernels;
-use crate::op::{self, Kept, Kernel};
+use crate::op::{self, InputGradients, Kept, Kernel};
 
 /// Vectors whose squared length is smaller have no gradient: their direction is noise.
 const MIN_SQUARE: f64 = 1e-24;
@@ -128,7 +128,7 @@ impl Kernel for MeanLengths {
         kept: Kept,
         upstream: &[f32],
         [wanted, ..]: [bool; 3],
-    ) -> [Option<Vec<f32>>; 3] {
+    ) -> InputGradients {
         if !wanted {
             return [None, None, None];
         }

@@ -18,9 +18,9 @@ pub enum Right<'a> {
 }
 
 impl<'a> Right<'a> {
-    /// The factor in bf16 if `half` is set and the processor has the instructions, else in f32.
-    pub fn new(half: bool, [k, n]: [usize; 2], matrix: Matrix<'a>) -> Self {
-        if half && bf16::is_there() { Self::packed([k, n], matrix) } else { Self::Plain(matrix) }
+    /// The factor in bf16 if `in_bf16` is set and the processor has the instructions, else in f32.
+    pub fn new(in_bf16: bool, [k, n]: [usize; 2], matrix: Matrix<'a>) -> Self {
+        if in_bf16 && bf16::is_there() { Self::packed([k, n], matrix) } else { Self::Plain(matrix) }
     }
 
     pub(crate) fn packed([depth, columns]: [usize; 2], (values, [stride, inner]): Matrix) -> Self {
@@ -44,85 +44,73 @@ impl<'a> Right<'a> {
     }
 }
 
-/// The product lhs `[m, k]` · rhs `[k, n]`.
-pub struct Multiply<'a> {
-    /// m, n, k.
-    pub size: [usize; 3],
-    /// Left factor.
-    pub lhs: Matrix<'a>,
-    /// Right factor.
-    pub rhs: &'a Right<'a>,
-    /// Adds the product to the values that are there.
-    pub add: bool,
+/// Writes the product lhs `[m, k]` · rhs `[k, n]` to `out` `[m, n]`, or adds the product to the values that are there.
+/// `size`: m, n, k.
+pub fn product(size: [usize; 3], lhs: Matrix, rhs: &Right, out: &mut [f32], add: bool) {
+    match rhs {
+        Right::Plain(rhs) => in_f32(size, lhs, *rhs, out, add),
+        Right::Packed(words) => product_in_bf16(size, lhs, words, out, add),
+    }
 }
 
-impl Multiply<'_> {
-    /// Writes the product to `out`, whose rows begin `stride` floats apart.
-    pub fn write(self, out: &mut [f32], stride: usize) {
-        match self.rhs {
-            Right::Plain(rhs) => self.in_f32(*rhs, out, stride),
-            Right::Packed(words) => self.in_bf16(words, out, stride),
-        }
+fn product_in_bf16(
+    [m, n, k]: [usize; 3],
+    (values, [inner, row]): Matrix,
+    rhs: &[u32],
+    out: &mut [f32],
+    add: bool,
+) {
+    /// Words of the left factor that are packed at once: 128 KiB, which leaves second-level cache for a panel.
+    const WORDS: usize = 32 * 1024;
+    let blocks = k.div_ceil(bf16::BLOCK);
+    let most = (WORDS / (blocks * bf16::PAIRS)).next_multiple_of(4 * bf16::PAIRS);
+    for first in (0..m).step_by(most) {
+        let values = &values[first * row..];
+        let source = Source { values, stride: row, inner, count: most.min(m - first), depth: k };
+        let packed = source.packed_rows();
+        let mut words = Words::new((blocks * packed + SLACK) * bf16::PAIRS);
+        let (rows, _) = words.as_chunks_mut();
+        source.pack_left(&mut rows[..blocks * packed]);
+        bf16::product(&source, rows, rhs.as_chunks::<PANEL>().0, n, |row, column, sums| {
+            let out = &mut out[(first + row) * n + column..][..sums.len()];
+            match add {
+                true => out.iter_mut().zip(sums).for_each(|(out, sum)| *out += sum),
+                false => out.copy_from_slice(sums),
+            }
+        });
     }
+}
 
-    fn in_bf16(&self, rhs: &[u32], out: &mut [f32], stride: usize) {
-        /// Words of the left factor that are packed at once: 128 KiB, which leaves second-level cache for a panel.
-        const WORDS: usize = 32 * 1024;
-        let Self { size: [m, columns, depth], lhs: (values, [inner, row]), add, .. } = *self;
-        let blocks = depth.div_ceil(bf16::BLOCK);
-        let most = (WORDS / (blocks * bf16::PAIRS)).next_multiple_of(4 * bf16::PAIRS);
-        for first in (0..m).step_by(most) {
-            let values = &values[first * row..];
-            let source = Source { values, stride: row, inner, count: most.min(m - first), depth };
-            let packed = source.packed_rows();
-            let mut words = Words::new((blocks * packed + SLACK) * bf16::PAIRS);
-            let (rows, _) = words.as_chunks_mut();
-            source.pack_left(&mut rows[..blocks * packed]);
-            bf16::product(&source, rows, rhs.as_chunks::<PANEL>().0, columns, |row, column, sums| {
-                let out = &mut out[(first + row) * stride + column..][..sums.len()];
-                match add {
-                    true => out.iter_mut().zip(sums).for_each(|(out, sum)| *out += sum),
-                    false => out.copy_from_slice(sums),
-                }
-            });
-        }
-    }
-
-    fn in_f32(&self, (rhs, rs): Matrix, out: &mut [f32], stride: usize) {
-        let Self { size: [m, n, k], lhs: (lhs, ls), add, .. } = *self;
-        let last = |rows: usize, columns: usize, [column, row]: [usize; 2]| {
-            (rows - 1) * row + (columns - 1) * column
-        };
-        assert!(m > 0 && n > 0 && k > 0 && stride >= n);
-        assert!(
-            last(m, k, ls) < lhs.len() && last(k, n, rs) < rhs.len() && last(m, n, [1, stride]) < out.len()
+fn in_f32([m, n, k]: [usize; 3], (lhs, ls): Matrix, (rhs, rs): Matrix, out: &mut [f32], add: bool) {
+    let last =
+        |rows: usize, columns: usize, [column, row]: [usize; 2]| (rows - 1) * row + (columns - 1) * column;
+    assert!(m > 0 && n > 0 && k > 0);
+    assert!(last(m, k, ls) < lhs.len() && last(k, n, rs) < rhs.len() && m * n <= out.len());
+    let s = |x: usize| x as isize;
+    let keep = if add { 1.0 } else { 0.0 };
+    // SAFETY: the assertions above bound every element that the strides reach; `out` is borrowed mutably.
+    #[allow(unsafe_code, reason = "the matrix product of the gemm crate takes pointers")]
+    unsafe {
+        gemm::gemm(
+            m,
+            n,
+            k,
+            out.as_mut_ptr(),
+            1,
+            s(n),
+            add,
+            lhs.as_ptr(),
+            s(ls[0]),
+            s(ls[1]),
+            rhs.as_ptr(),
+            s(rs[0]),
+            s(rs[1]),
+            keep,
+            1.0,
+            false,
+            false,
+            false,
+            gemm::Parallelism::None,
         );
-        let s = |x: usize| x as isize;
-        let keep = if add { 1.0 } else { 0.0 };
-        // SAFETY: the assertions above bound every element that the strides reach; `out` is borrowed mutably.
-        #[allow(unsafe_code, reason = "the matrix product of the gemm crate takes pointers")]
-        unsafe {
-            gemm::gemm(
-                m,
-                n,
-                k,
-                out.as_mut_ptr(),
-                1,
-                s(stride),
-                add,
-                lhs.as_ptr(),
-                s(ls[0]),
-                s(ls[1]),
-                rhs.as_ptr(),
-                s(rs[0]),
-                s(rs[1]),
-                keep,
-                1.0,
-                false,
-                false,
-                false,
-                gemm::Parallelism::None,
-            );
-        }
     }
 }

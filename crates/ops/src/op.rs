@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use burn::backend::autodiff::Autodiff;
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
-use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::grads;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
@@ -31,8 +31,11 @@ pub trait Kernel: Debug + Send + Sync + 'static {
         kept: Kept,
         upstream: &[f32],
         wanted: [bool; 3],
-    ) -> [Option<Vec<f32>>; 3];
+    ) -> InputGradients;
 }
+
+/// The gradients of the inputs; `None` for unwanted ones.
+pub type InputGradients = [Option<Vec<f32>>; 3];
 
 /// Values that an operator keeps for its backward pass.
 pub type Kept = Option<Box<dyn Any + Send>>;
@@ -45,22 +48,22 @@ pub struct Inputs<B: Backend> {
     z: FloatTensor<B>,
 }
 
-/// The result of a call.
+/// One tensor of a call: its result, or its only input.
 #[derive(ExtensionType, Clone, Debug)]
-pub struct Output<B: Backend> {
-    tensor: FloatTensor<B>,
+pub struct One<B: Backend> {
+    pub(crate) tensor: FloatTensor<B>,
 }
 
 /// Backends that run a [`Kernel`].
 #[backend_extension(Flex, Autodiff)]
 pub trait KernelBackend: Backend {
     /// Runs `kernel`.
-    fn run(#[extension_type] inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self>;
+    fn run(#[extension_type] inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> One<Self>;
 }
 
 impl KernelBackend for Flex {
-    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self> {
-        Output { tensor: forward(&inputs, &*kernel, false).0 }
+    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> One<Self> {
+        One { tensor: forward(&inputs, &*kernel, false).0 }
     }
 }
 
@@ -93,7 +96,7 @@ struct Call {
 impl Backward<Flex, 3> for KernelBackward {
     type State = Call;
 
-    fn backward(self, ops: Ops<Call, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+    fn backward(self, ops: Ops<Call, 3>, grads: &mut grads::Gradients, _checkpointer: &mut Checkpointer) {
         let upstream = grads.consume::<Flex>(&ops.node).to_contiguous();
         let Call { inputs, kernel, kept } = ops.state;
         let (fields, wanted) = (contiguous(&inputs), ops.parents.each_ref().map(Option::is_some));
@@ -109,7 +112,7 @@ impl Backward<Flex, 3> for KernelBackward {
 }
 
 impl<C: CheckpointStrategy> KernelBackend for Autodiff<Flex, C> {
-    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> Output<Self> {
+    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> One<Self> {
         let nodes = [inputs.x.node(), inputs.y.node(), inputs.z.node()];
         let inputs = Inputs {
             x: inputs.x.into_primitive(),
@@ -123,7 +126,7 @@ impl<C: CheckpointStrategy> KernelBackend for Autodiff<Flex, C> {
             }
             OpsKind::UnTracked(_) => Self::from_inner(forward(&inputs, &*kernel, false).0),
         };
-        Output { tensor }
+        One { tensor }
     }
 }
 

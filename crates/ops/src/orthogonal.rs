@@ -1,6 +1,6 @@
 //! Newton-Schulz orthogonalisation of matrices for the optimiser Muon (Jordan et al., "Muon").
 
-use crate::multiply::{Multiply, Right};
+use crate::multiply::{self, Right};
 
 /// Coefficients of x, x³ and x⁵ in a step, by Muon's authors. They bring singular values to between 0.7 and 1.2.
 const COEFFICIENTS: [f32; 3] = [3.4445, -4.775, 2.0315];
@@ -31,11 +31,10 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     let [mut gram, mut correction, mut next, mut all] = [(); 4].map(|()| vec![0.0; m * m]);
     let [a, b, c] = COEFFICIENTS;
     let product = |lhs: &[f32], rhs: &[f32], out: &mut [f32]| {
-        Multiply { size: [m, m, m], lhs: (lhs, [1, m]), rhs: &Right::Plain((rhs, [1, m])), add: false }
-            .write(out, m);
+        multiply::product([m, m, m], (lhs, [1, m]), &Right::Plain((rhs, [1, m])), out, false);
     };
     let transposed = Right::Plain((&x, [strides[1], strides[0]]));
-    Multiply { size: [m, m, n], lhs: (&x, strides), rhs: &transposed, add: false }.write(&mut gram, m);
+    multiply::product([m, m, n], (&x, strides), &transposed, &mut gram, false);
     gram.iter_mut().for_each(|value| *value = flushed(*value));
     // `all` is the product of all Q. It begins as the identity.
     all.iter_mut().step_by(m + 1).for_each(|diagonal| *diagonal = 1.0);
@@ -52,11 +51,9 @@ pub fn orthogonalised(matrix: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32>
     let mut out = vec![0.0; m * n];
     if is_tall {
         // The transpose of (all · x), since `all` is symmetric: xᵀ · all, row by row as it is stored.
-        Multiply { size: [n, m, m], lhs: (&x, [1, m]), rhs: &Right::Plain((&all, [1, m])), add: false }
-            .write(&mut out, m);
+        multiply::product([n, m, m], (&x, [1, m]), &Right::Plain((&all, [1, m])), &mut out, false);
     } else {
-        Multiply { size: [m, n, m], lhs: (&all, [1, m]), rhs: &Right::Plain((&x, [1, n])), add: false }
-            .write(&mut out, n);
+        multiply::product([m, n, m], (&all, [1, m]), &Right::Plain((&x, [1, n])), &mut out, false);
     }
     out
 }

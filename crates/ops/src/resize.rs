@@ -4,13 +4,13 @@
 use burn::tensor::module::interpolate;
 use burn::tensor::ops::{InterpolateMode, InterpolateOptions};
 use burn::tensor::{Tensor, TensorData};
-use pulp::Arch;
 use rayon::prelude::*;
 use snapsnap_base::bilinear::{Tap, taps};
 
 use crate::buffers::take;
 use crate::device::has_kernels;
-use crate::op::{self, Kept, Kernel};
+use crate::op::{self, InputGradients, Kept, Kernel};
+use crate::vectors::vectorized;
 
 /// Bilinear resize of `[B, C, H, W]` to `size` (rows, columns).
 ///
@@ -59,13 +59,7 @@ impl Kernel for Resize {
         (resize(x, [self.from[2], self.from[3]], &self.down, &self.across), None)
     }
 
-    fn backward(
-        &self,
-        _inputs: [&[f32]; 3],
-        _kept: Kept,
-        upstream: &[f32],
-        _wanted: [bool; 3],
-    ) -> [Option<Vec<f32>>; 3] {
+    fn backward(&self, _: [&[f32]; 3], _: Kept, upstream: &[f32], _: [bool; 3]) -> InputGradients {
         let size = [self.from[2], self.from[3]];
         [Some(resize_gradient(upstream, size, &self.down, &self.across)), None, None]
     }
@@ -109,23 +103,24 @@ fn stretch(row: &[f32], across: &[Tap], out: &mut [f32]) {
 fn resize_gradient(gradient: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across: &[Tap]) -> Vec<f32> {
     let size = down.len() * across.len();
     let mut out = take(gradient.len() / size * rows * columns);
-    let (down, across) = (Back::new(down, rows), Back::new(across, columns));
+    let width = across.len();
+    let (down, across) = (uses(down, rows), uses(across, columns));
     let tasks = out.par_chunks_exact_mut(rows * columns).zip(gradient.par_chunks_exact(size));
     tasks.for_each_init(
-        || vec![0.0; size / down.targets],
+        || vec![0.0; width],
         |sum, (out, gradient)| {
             // Rows are summed first, because whole rows are vectors.
-            for (row, out) in out.chunks_exact_mut(columns).enumerate() {
+            for (uses, out) in down.iter().zip(out.chunks_exact_mut(columns)) {
                 sum.fill(0.0);
-                for &(from, weight) in down.of(row) {
-                    let line = &gradient[from * sum.len()..][..sum.len()];
-                    Arch::new().dispatch(
+                for &(from, weight) in uses {
+                    let line = &gradient[from * width..][..width];
+                    vectorized(
                         #[inline(always)]
                         || sum.iter_mut().zip(line).for_each(|(sum, x)| *sum += weight * x),
                     );
                 }
-                for (column, out) in out.iter_mut().enumerate() {
-                    *out = across.of(column).iter().map(|&(from, weight)| weight * sum[from]).sum();
+                for (out, uses) in out.iter_mut().zip(&across) {
+                    *out = uses.iter().map(|&(from, weight)| weight * sum[from]).sum();
                 }
             }
         },
@@ -133,32 +128,16 @@ fn resize_gradient(gradient: &[f32], [rows, columns]: [usize; 2], down: &[Tap], 
     out
 }
 
-/// The transpose of taps: for every position that is read, the positions that are written from it.
-struct Back {
-    /// Number of written positions.
-    targets: usize,
-    /// Index of the first use of every position, then the number of all uses.
-    starts: Vec<usize>,
-    /// Written positions with their weights, which are not 0.
-    uses: Vec<(usize, f32)>,
-}
-
-impl Back {
-    fn new(taps: &[Tap], from: usize) -> Self {
-        let parts = |&(target, &(low, high, weight)): &(usize, &Tap)| {
-            [(low, target, 1.0 - weight), (high, target, weight)]
-        };
-        let mut all: Vec<_> = taps.iter().enumerate().collect::<Vec<_>>().iter().flat_map(parts).collect();
-        all.retain(|&(.., weight)| weight != 0.0);
-        // The sort is stable, so that uses stay in the order of the written positions.
-        all.sort_by_key(|&(position, ..)| position);
-        let starts = (0..=from).map(|position| all.partition_point(|use_| use_.0 < position)).collect();
-        let uses = all.into_iter().map(|(_, target, weight)| (target, weight)).collect();
-        Self { targets: taps.len(), starts, uses }
+/// The transpose of taps: for each of `count` positions that are read, the positions that are written from it in their
+/// order, with their weights, which are not 0.
+fn uses(taps: &[Tap], count: usize) -> Vec<Vec<(usize, f32)>> {
+    let mut uses = vec![Vec::new(); count];
+    for (target, &(low, high, weight)) in taps.iter().enumerate() {
+        for (position, weight) in [(low, 1.0 - weight), (high, weight)] {
+            if weight != 0.0 {
+                uses[position].push((target, weight));
+            }
+        }
     }
-
-    /// Uses of a position that is read.
-    fn of(&self, position: usize) -> &[(usize, f32)] {
-        &self.uses[self.starts[position]..self.starts[position + 1]]
-    }
+    uses
 }

@@ -4,36 +4,37 @@ use burn::tensor::Tensor;
 use burn::tensor::module::attention;
 
 use crate::device::{has_kernels, host};
-use crate::op::{self, Kept, Kernel};
+use crate::op::{self, InputGradients, Kept, Kernel};
 use crate::operators::{Attention, Tokens};
 use crate::rope::Rope;
 
-/// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v: `q` `[B, N, C]`, `k` and `v` `[B, M, C]` → `[B, N, C]`, with the heads
-/// side by side in the channels. Queries and keys lie on the same grid. `half`: products in bf16, if the CPU has them.
+/// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v of `q`, `k` and `v` `[B, N, C]` → `[B, N, C]`, with the heads side by
+/// side in the channels. Queries and keys lie on the same grid. `in_bf16`: products in bf16, if the CPU has them.
 pub fn rotary_attention(
     q: Tensor<3>,
     k: Tensor<3>,
     v: Tensor<3>,
     rope: &Rope,
     heads: usize,
-    half: bool,
+    in_bf16: bool,
 ) -> Tensor<3> {
     if !has_kernels(&q) {
-        return plain_attention(q, k, v, [rope, rope], heads);
+        return plain_attention(q, k, v, rope, heads);
     }
-    let ([batch, queries, c], keys) = (q.dims(), k.dims()[1]);
-    let sizes = Attention { batch, queries, keys, heads, head_dim: c / heads, half };
+    let [batch, tokens, c] = q.dims();
+    assert_eq!([k.dims(), v.dims()], [q.dims(); 2], "queries, keys and values of one grid");
+    let sizes = Attention { batch, tokens, heads, head_dim: c / heads, in_bf16 };
     op::run(Attend { sizes, tables: tables(rope), apart: true }, q, Some(k), Some(v))
 }
 
 /// [`rotary_attention`] with queries, keys and values side by side in one tensor: `[B, N, 3·C]` → `[B, N, C]`.
-pub fn rotary_self_attention(qkv: Tensor<3>, rope: &Rope, heads: usize, half: bool) -> Tensor<3> {
+pub fn rotary_self_attention(qkv: Tensor<3>, rope: &Rope, heads: usize, in_bf16: bool) -> Tensor<3> {
     let ([batch, tokens, _], c) = (qkv.dims(), qkv.dims()[2] / 3);
     if !has_kernels(&qkv) {
         let part = |i: usize| qkv.clone().narrow(2, i * c, c);
-        return plain_attention(part(0), part(1), part(2), [rope, rope], heads);
+        return plain_attention(part(0), part(1), part(2), rope, heads);
     }
-    let sizes = Attention { batch, queries: tokens, keys: tokens, heads, head_dim: c / heads, half };
+    let sizes = Attention { batch, tokens, heads, head_dim: c / heads, in_bf16 };
     let none: Option<Tensor<1>> = None;
     op::run(Attend { sizes, tables: tables(rope), apart: false }, qkv, none.clone(), none)
 }
@@ -42,20 +43,17 @@ fn tables(rope: &Rope) -> [Vec<f32>; 2] {
     [host(rope.cos.clone()), host(rope.sin.clone())]
 }
 
-/// [`rotary_attention`] in Burn's operators, with one table for queries and one for keys.
+/// [`rotary_attention`] in Burn's operators.
 pub(crate) fn plain_attention(
     q: Tensor<3>,
     k: Tensor<3>,
     v: Tensor<3>,
-    ropes: [&Rope; 2],
+    rope: &Rope,
     heads: usize,
 ) -> Tensor<3> {
     let [b, n, c] = q.dims();
-    let split = |x: Tensor<3>| {
-        let tokens = x.dims()[1];
-        x.reshape([b, tokens, heads, c / heads]).swap_dims(1, 2)
-    };
-    let (q, k) = (ropes[0].apply(split(q)), ropes[1].apply(split(k)));
+    let split = |x: Tensor<3>| x.reshape([b, n, heads, c / heads]).swap_dims(1, 2);
+    let (q, k) = (rope.apply(split(q)), rope.apply(split(k)));
     let out = attention(q, k, split(v), None, None, Default::default());
     out.swap_dims(1, 2).reshape([b, n, c])
 }
@@ -78,14 +76,13 @@ impl Attend {
 
 impl Kernel for Attend {
     fn shape(&self) -> Vec<usize> {
-        vec![self.sizes.batch, self.sizes.queries, self.sizes.heads * self.sizes.head_dim]
+        vec![self.sizes.batch, self.sizes.tokens, self.sizes.heads * self.sizes.head_dim]
     }
 
     fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let tables = self.tables.each_ref().map(Vec::as_slice);
         let (out, logarithms) = self.sizes.forward(self.tokens(inputs), tables);
-        let kept: Kept = if keep { Some(Box::new(logarithms)) } else { None };
-        (out, kept)
+        (out, keep.then(|| Box::new(logarithms) as _))
     }
 
     fn backward(
@@ -94,7 +91,7 @@ impl Kernel for Attend {
         kept: Kept,
         upstream: &[f32],
         wanted: [bool; 3],
-    ) -> [Option<Vec<f32>>; 3] {
+    ) -> InputGradients {
         let logarithms =
             kept.and_then(|kept| kept.downcast::<Vec<f32>>().ok()).expect("kept by the forward pass");
         let (tokens, tables) = (self.tokens(inputs), self.tables.each_ref().map(Vec::as_slice));

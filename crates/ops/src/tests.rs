@@ -1,34 +1,9 @@
-//! The kernels against the plain tensor code, at sizes that are no multiple of a block.
+//! Sums in two steps against Burn's.
 
-use burn::module::Param;
-use burn::nn::LinearConfig;
-use burn::tensor::activation::gelu;
-use burn::tensor::{Device, FloatDType};
+use burn::tensor::FloatDType;
 
-use crate::rotary::plain_attention;
-use crate::testing::{assert_equal, random, tensor, values};
-use crate::{Rope, linear_gelu, mean, rotary_attention, spread_last, sum_last};
-
-#[test]
-fn rotary_attention_equals_its_composition() {
-    for (rows, columns, heads, head_dim) in [(2, 3, 2, 4), (13, 11, 3, 16), (16, 17, 1, 64)] {
-        let (n, dim) = (rows * columns, heads * head_dim);
-        let rope = Rope::new(rows, columns, head_dim, 100.0, &Device::flex());
-        let [q, k, v] = [1, 2, 3].map(|seed| random([2, n, dim], seed));
-        let expected = plain_attention(q.clone(), k.clone(), v.clone(), [&rope, &rope], heads);
-        let got = rotary_attention(q, k, v, &rope, heads, false);
-        assert_equal(&format!("{n} tokens"), &values(got), &values(expected));
-    }
-}
-
-#[test]
-fn linear_gelu_equals_its_composition() {
-    let mut layer = LinearConfig::new(20, 37).init(&Device::flex());
-    layer.weight = Param::from_tensor(random([20, 37], 1));
-    layer.bias = Some(Param::from_tensor(random([37], 2)));
-    let x = random([2, 19, 20], 3);
-    assert_equal("gelu", &values(linear_gelu(&layer, x.clone())), &values(gelu(layer.forward(x))));
-}
+use crate::testing::{assert_equal, tensor, values};
+use crate::{mean, spread_last, sum_last};
 
 /// Also for a prime number of values, which are summed in one step.
 #[test]

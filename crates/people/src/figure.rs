@@ -61,6 +61,23 @@ pub struct Pose {
 
 /// Share of people who walk.
 const WALKING: f32 = 0.17;
+/// Kinds of poses of an arm: the share of arms up to each kind, and the ranges of [`Pose::arms`].
+const ARMS: [(f32, [(f32, f32); 4]); 7] = [
+    // Close to the body.
+    (0.2, [(4.0, 12.0), (-8.0, 10.0), (-5.0, 25.0), (3.0, 22.0)]),
+    // A little away.
+    (0.4, [(10.0, 25.0), (-8.0, 12.0), (-5.0, 25.0), (3.0, 30.0)]),
+    // Farther away.
+    (0.53, [(25.0, 55.0), (-8.0, 8.0), (-10.0, 20.0), (2.0, 20.0)]),
+    // About level.
+    (0.62, [(70.0, 95.0), (-8.0, 8.0), (-10.0, 20.0), (0.0, 12.0)]),
+    // On the hip.
+    (0.76, [(42.0, 52.0), (-22.0, -12.0), (78.0, 95.0), (88.0, 102.0)]),
+    // In the pocket.
+    (0.86, [(14.0, 24.0), (-26.0, -12.0), (15.0, 40.0), (30.0, 52.0)]),
+    // Anywhere.
+    (1.0, [(12.0, 110.0), (-15.0, 60.0), (-10.0, 60.0), (5.0, 95.0)]),
+];
 
 impl Pose {
     pub fn draw(random: &mut impl Rng) -> Self {
@@ -103,28 +120,8 @@ impl Pose {
         let alike = between(0.0, 1.0) < 0.6;
         for arm in &mut pose.arms {
             let kind = if alike { kind } else { between(0.0, 1.0) };
-            *arm = match kind {
-                // Close to the body; a little away; farther away; about level; on the hip; in the pocket; anywhere.
-                k if k < 0.2 => {
-                    [between(4.0, 12.0), between(-8.0, 10.0), between(-5.0, 25.0), between(3.0, 22.0)]
-                }
-                k if k < 0.4 => {
-                    [between(10.0, 25.0), between(-8.0, 12.0), between(-5.0, 25.0), between(3.0, 30.0)]
-                }
-                k if k < 0.53 => {
-                    [between(25.0, 55.0), between(-8.0, 8.0), between(-10.0, 20.0), between(2.0, 20.0)]
-                }
-                k if k < 0.62 => {
-                    [between(70.0, 95.0), between(-8.0, 8.0), between(-10.0, 20.0), between(0.0, 12.0)]
-                }
-                k if k < 0.76 => {
-                    [between(42.0, 52.0), between(-22.0, -12.0), between(78.0, 95.0), between(88.0, 102.0)]
-                }
-                k if k < 0.86 => {
-                    [between(14.0, 24.0), between(-26.0, -12.0), between(15.0, 40.0), between(30.0, 52.0)]
-                }
-                _ => [between(12.0, 110.0), between(-15.0, 60.0), between(-10.0, 60.0), between(5.0, 95.0)],
-            };
+            let (_, ranges) = ARMS.into_iter().find(|(share, _)| kind < *share).expect("kinds are below 1");
+            *arm = ranges.map(|(low, high)| between(low, high));
         }
         pose
     }

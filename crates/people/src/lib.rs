@@ -3,7 +3,7 @@
 
 pub mod avatars;
 mod figure;
-mod files;
+pub mod files;
 mod joint_names;
 pub mod makehuman;
 mod math;

@@ -4,23 +4,19 @@ use std::f32::consts::PI;
 
 use glam::{Mat3, Vec2, Vec3};
 
-pub fn sin_cos(angle: f32) -> (f32, f32) {
-    libm::sincosf(angle)
-}
-
 /// Right-handed rotations by degrees.
 pub fn rotate_x(degrees: f32) -> Mat3 {
-    let (s, c) = sin_cos(degrees * PI / 180.0);
+    let (s, c) = libm::sincosf(degrees * PI / 180.0);
     Mat3::from_cols(Vec3::X, Vec3::new(0.0, c, s), Vec3::new(0.0, -s, c))
 }
 
 pub fn rotate_y(degrees: f32) -> Mat3 {
-    let (s, c) = sin_cos(degrees * PI / 180.0);
+    let (s, c) = libm::sincosf(degrees * PI / 180.0);
     Mat3::from_cols(Vec3::new(c, 0.0, -s), Vec3::Y, Vec3::new(s, 0.0, c))
 }
 
 pub fn rotate_z(degrees: f32) -> Mat3 {
-    let (s, c) = sin_cos(degrees * PI / 180.0);
+    let (s, c) = libm::sincosf(degrees * PI / 180.0);
     Mat3::from_cols(Vec3::new(c, s, 0.0), Vec3::new(-s, c, 0.0), Vec3::Z)
 }
 

@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3};
 use rand::Rng;
 
-use crate::math::{hash, noise2, sin_cos, smoothstep};
+use crate::math::{hash, noise2, smoothstep};
 
 /// Kinds of weave and print.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -150,7 +150,7 @@ impl Pattern {
                 let jitter = |k: u32| 0.3 * (hash(x, y, 0, self.seed ^ k) - 0.5);
                 let d = f - Vec2::splat(0.5) - Vec2::new(jitter(1), jitter(2));
                 let angle = libm::atan2f(d.y, d.x);
-                let petals = 0.2 + 0.1 * sin_cos(5.0 * angle + 6.0 * jitter(3)).1;
+                let petals = 0.2 + 0.1 * libm::sincosf(5.0 * angle + 6.0 * jitter(3)).1;
                 let petal = 1.0 - smoothstep(petals, petals + 2.0 * soft, d.length());
                 a.lerp(b, petal).lerp(c, 1.0 - smoothstep(0.07, 0.07 + 2.0 * soft, d.length()))
             }
@@ -235,9 +235,9 @@ impl Print {
                 let (r, angle) = (p.length(), libm::atan2f(p.x, p.y));
                 let edge = match self.sign {
                     0 => 0.45,
-                    1 => 0.33 + 0.14 * sin_cos(5.0 * angle).1,
+                    1 => 0.33 + 0.14 * libm::sincosf(5.0 * angle).1,
                     2 => 0.5 / (p.x.abs().max(p.y.abs()) / r.max(1e-6)) * 0.8,
-                    _ => 0.3 + 0.18 * sin_cos(3.0 * angle).1,
+                    _ => 0.3 + 0.18 * libm::sincosf(3.0 * angle).1,
                 };
                 if r < 0.5 * edge {
                     second

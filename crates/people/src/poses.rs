@@ -80,15 +80,11 @@ struct Joint {
 type Channel = Option<usize>;
 
 fn channel(word: &str) -> Option<Channel> {
-    let axis = match word.as_bytes().first()? {
-        b'X' | b'x' => 0,
-        b'Y' | b'y' => 1,
-        b'Z' | b'z' => 2,
-        _ => return None,
-    };
-    match word.get(1..)?.to_ascii_lowercase().as_str() {
-        "position" => Some(None),
-        "rotation" => Some(Some(axis)),
+    match word.to_ascii_lowercase().as_str() {
+        "xposition" | "yposition" | "zposition" => Some(None),
+        "xrotation" => Some(Some(0)),
+        "yrotation" => Some(Some(1)),
+        "zrotation" => Some(Some(2)),
         _ => None,
     }
 }
@@ -207,8 +203,8 @@ impl Rows {
             let [first, second, third] = names.map(|name| need(&known, name, side));
             Ok([first?, second?, third?])
         };
-        let arm = [Name::UpperArm, Name::Forearm, Name::Hand];
-        let leg = [Name::Thigh, Name::Calf, Name::Foot];
+        let arm = [Name::Arm, Name::ForeArm, Name::Hand];
+        let leg = [Name::UpLeg, Name::Leg, Name::Foot];
         Ok(Self {
             neck: need(&known, Name::Neck, 0)?,
             arms: [limb(arm, 0)?, limb(arm, 1)?],
@@ -302,26 +298,21 @@ mod tests {
             let Vec3 { x, y, z } = way;
             format!("JOINT {name}\n{{\nOFFSET {x} {y} {z}\nCHANNELS 3 Zrotation Xrotation Yrotation\n")
         };
-        let chain = |names: [&str; 3], from: Vec3, places: [Vec3; 3]| {
-            let [a, b, c] = places;
+        let chain = |side: &str, names: [&str; 3], [a, b, c, d]: [Vec3; 4]| {
+            let ways = [offset(a, b), offset(b, c), offset(c, d)];
+            let joints = names.into_iter().zip(ways).map(|(name, way)| start(&format!("{side}{name}"), way));
             let ends = format!("End Site\n{{\nOFFSET 0 0 0\n}}\n{}", "}\n".repeat(3));
-            start(names[0], offset(from, a))
-                + &start(names[1], offset(a, b))
-                + &start(names[2], offset(b, c))
-                + &ends
+            joints.collect::<String>() + &ends
         };
         let hips = figure.pelvis.start;
         let mut text = start("Hips", Vec3::ZERO).replace("JOINT", "ROOT");
         text += &start("Neck", offset(hips, figure.chest.end));
         text += "}\n";
         for (side, word) in ["Left", "Right"].into_iter().enumerate() {
-            let names = |names: [&str; 3]| names.map(|name| format!("{word}{name}"));
             let (arm, fore) = (figure.upper_arms[side], figure.forearms[side]);
-            let [a, b, c] = &names(["Arm", "ForeArm", "Hand"]);
-            text += &chain([a, b, c], hips, [arm.start, fore.start, fore.end]);
+            text += &chain(word, ["Arm", "ForeArm", "Hand"], [hips, arm.start, fore.start, fore.end]);
             let (thigh, calf) = (figure.thighs[side], figure.calves[side]);
-            let [a, b, c] = &names(["UpLeg", "Leg", "Foot"]);
-            text += &chain([a, b, c], hips, [thigh.start, calf.start, calf.end]);
+            text += &chain(word, ["UpLeg", "Leg", "Foot"], [hips, thigh.start, calf.start, calf.end]);
         }
         let zeros = "0 ".repeat(3 * 14);
         format!("HIERARCHY\n{text}}}\nMOTION\nFrames: 1\nFrame Time: 0.04\n{zeros}\n")

@@ -151,11 +151,6 @@ fn place(person: Rect, x: u32, y: u32, mirrored: bool) -> (u32, u32) {
     (at(person.x, person.width, x), at(person.y, person.height, y))
 }
 
-/// All places of the grid.
-fn grid() -> impl Iterator<Item = (u32, u32)> {
-    (0..GRID).flat_map(|y| (0..GRID).map(move |x| (x, y)))
-}
-
 /// Intersection over union of the front's and the mirrored back's silhouette, at one height and where they overlap
 /// most. Widths may differ: an arm looks longer in the photograph in which it is nearer to the camera.
 fn overlap(front: &Cutout, back: &Cutout) -> f32 {
@@ -190,7 +185,7 @@ fn silhouette(one: &Cutout, mirrored: bool) -> Vec<Vec<bool>> {
 /// Whether the person has the same colours in both pictures, or in one and the mirror image of the other.
 fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
     let (mut sum, mut count) = (0.0, 0);
-    for (x, y) in grid() {
+    for (x, y) in (0..GRID).flat_map(|y| (0..GRID).map(move |x| (x, y))) {
         let [a, b] = [(front, false), (back, mirrored)].map(|(one, mirrored)| {
             let at = place(one.report.person, x, y, mirrored);
             (color(&one.rgb, at), one.mask.get_pixel(at.0, at.1)[0] >= INSIDE)

@@ -49,17 +49,20 @@ impl Shot {
         let focal = field(Tag::FocalLengthIn35mmFilm).and_then(|value| value.get_uint(0));
         // The camera beside the screen looks the other way, so the pitch would be wrong.
         let is_selfie = field(Tag::LensModel).is_some_and(|lens| matches!(lens, Value::Ascii(texts) if texts.iter().any(|text| text.windows(5).any(|part| part == b"front"))));
-        let note = match field(Tag::MakerNote) {
-            Some(Value::Undefined(bytes, _)) if !is_selfie => acceleration(bytes),
+        let pitch = match field(Tag::MakerNote) {
+            Some(Value::Undefined(note, _)) if !is_selfie => pitch(note),
             _ => None,
         };
-        // Axes of a telephone seen from its front: x left, y down, z into it, which is the direction of the camera at
-        // its back. The acceleration is opposite to gravity.
-        let pitch = note
-            .filter(|up| (0.8..1.2).contains(&up.length()))
-            .map(|up| (-up.z / up.length()).asin().to_degrees());
         Self { focal: focal.map(f64::from).filter(|focal| FOCALS.contains(focal)), pitch }
     }
+}
+
+/// How far the optical axis looks down, in degrees, by Apple's maker note.
+fn pitch(note: &[u8]) -> Option<f64> {
+    // Axes of a telephone seen from its front: x left, y down, z into it, which is the direction of the camera at its
+    // back. The acceleration is opposite to gravity.
+    let up = acceleration(note).filter(|up| (0.8..1.2).contains(&up.length()))?;
+    Some((-up.z / up.length()).asin().to_degrees())
 }
 
 /// The acceleration in units of gravity from Apple's maker note, a TIFF directory with offsets from the note's start.
@@ -150,8 +153,8 @@ mod tests {
 
     use super::*;
 
-    /// A telephone's EXIF segment: 26 mm, and Apple's note with this acceleration in thousandths.
-    fn segment(acceleration: [i32; 3]) -> Vec<u8> {
+    /// Apple's note with this acceleration in thousandths.
+    fn note(acceleration: [i32; 3]) -> Vec<u8> {
         let mut note = [
             APPLE,
             b"\0\x01MM",
@@ -166,40 +169,19 @@ mod tests {
         acceleration
             .iter()
             .for_each(|value| note.extend([value.to_be_bytes(), 1000_i32.to_be_bytes()].concat()));
-        // Directories 0 and Exif, of one and two entries.
-        let entry = |tag: u16, kind: u16, count: u32, value: [u8; 4]| {
-            [&tag.to_be_bytes()[..], &kind.to_be_bytes(), &count.to_be_bytes(), &value].concat()
-        };
-        let mut tiff = b"MM\0\x2a\0\0\0\x08\0\x01".to_vec();
-        tiff.extend(entry(0x8769, 4, 1, 26_u32.to_be_bytes()));
-        tiff.extend([0; 4]);
-        tiff.extend(2_u16.to_be_bytes());
-        tiff.extend(entry(0x927c, 7, note.len() as u32, 56_u32.to_be_bytes()));
-        tiff.extend(entry(0xa405, 3, 1, [0, 26, 0, 0]));
-        tiff.extend([0; 4]);
-        assert_eq!(tiff.len(), 56);
-        [tiff, note].concat()
-    }
-
-    fn shot(tiff: &[u8]) -> Shot {
-        exif::Reader::new().read_raw(tiff.to_vec()).map_or(Shot::default(), |exif| Shot::in_exif(&exif))
+        note
     }
 
     #[test]
-    fn telephones_tell_focal_length_and_pitch() {
+    fn telephones_tell_their_pitch() {
         // Upright, and looking down by 10°.
-        assert_eq!(shot(&segment([0, -1000, 0])), Shot { focal: Some(26.0), pitch: Some(0.0) });
-        let pitch = shot(&segment([0, -985, -174])).pitch.expect("a pitch");
-        assert!((pitch - 10.0).abs() < 0.1, "{pitch}");
-        // A telephone that is being shaken tells nothing.
-        assert_eq!(shot(&segment([0, -2000, 0])).pitch, None);
-        let whole = segment([0, -1000, 0]);
-        for length in 0..whole.len() {
-            let found = shot(&whole[..length]);
-            assert!(
-                found.focal.is_none_or(|focal| focal == 26.0) && found.pitch.is_none_or(|pitch| pitch == 0.0)
-            );
-        }
+        let whole = note([0, -1000, 0]);
+        assert_eq!(pitch(&whole), Some(0.0));
+        let down = pitch(&note([0, -985, -174])).expect("a pitch");
+        assert!((down - 10.0).abs() < 0.1, "{down}");
+        // A telephone that is being shaken tells nothing, and neither does a part of a note.
+        assert_eq!(pitch(&note([0, -2000, 0])), None);
+        assert!((0..whole.len()).all(|length| pitch(&whole[..length]).is_none()));
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use glam::Vec3;
 use image::{GrayImage, RgbImage};
 
-use super::INSIDE;
+use super::{INSIDE, median};
 use crate::rect::Rect;
 
 /// Number of rows of the person's box that are compared.
@@ -46,7 +46,8 @@ pub(super) fn match_back(
                 && a.max_element().max(b.max_element()) < USABLE.1;
             (!wider && usable).then(|| (a.max(Vec3::splat(DARK)) / b.max(Vec3::splat(DARK))).ln())
         };
-        sum += median(both.filter_map(ratio).collect())?;
+        let ratios: Vec<Vec3> = both.filter_map(ratio).collect();
+        sum += median(&ratios).filter(|_| ratios.len() >= FEWEST)?;
     }
     let ratio = 0.5 * sum;
     let brightness = ratio.element_sum() / 3.0;
@@ -94,16 +95,6 @@ fn edges(rgb: &RgbImage, mask: &GrayImage) -> Option<Vec<Option<Row>>> {
         Some(Row { width: (right - left + 1) as f32 / height, colors })
     };
     Some((0..ROWS).map(row).collect())
-}
-
-/// The median of each channel.
-fn median(values: Vec<Vec3>) -> Option<Vec3> {
-    let middle = values.len() / 2;
-    let channel = |c: usize| {
-        let mut channel: Vec<f32> = values.iter().map(|value| value[c]).collect();
-        *channel.select_nth_unstable_by(middle, f32::total_cmp).1
-    };
-    (values.len() >= FEWEST).then(|| Vec3::new(channel(0), channel(1), channel(2)))
 }
 
 #[cfg(test)]

@@ -45,7 +45,7 @@ pub use source::{Content, Cutting, Placement, Source};
 const INSIDE: u8 = 128;
 
 /// Photographs of one person on their canvases: the front, then the back and other sides if there are more.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Photographs {
     /// The photographs, on canvases of one size.
     pub canvases: Vec<Photograph>,
@@ -74,15 +74,11 @@ pub fn read(
     placement: Placement,
     focal: Option<f64>,
 ) -> Result<Photographs, FileError> {
-    let mut cutouts = Vec::new();
-    for source in sources {
-        cutouts.push(Cutout::read(*source, cutting, side, placement)?);
-    }
+    let cutouts = sources.iter().map(|source| Cutout::read(*source, cutting, side, placement));
+    let mut cutouts = cutouts.collect::<Result<Vec<_>, _>>()?;
     // One camera took all photographs: a value that one file lacks is taken from another file.
-    let (mut pitch, mut lens) = (None, focal);
-    for cutout in &cutouts {
-        (pitch, lens) = (pitch.or(cutout.frame.shot.pitch), lens.or(cutout.frame.shot.focal));
-    }
+    let pitch = cutouts.iter().find_map(|cutout| cutout.frame.shot.pitch);
+    let lens = cutouts.iter().find_map(|cutout| cutout.frame.shot.focal);
     for cutout in &mut cutouts {
         let own = &mut cutout.frame.shot;
         (own.focal, own.pitch) = (focal.or(own.focal).or(lens), own.pitch.or(pitch));
@@ -108,13 +104,7 @@ pub fn read(
             standing = common(&cutouts);
         }
     }
-    let mut made = Photographs {
-        canvases: Vec::new(),
-        frames: Vec::new(),
-        cutouts: Vec::new(),
-        reports: Vec::new(),
-        doubts,
-    };
+    let mut made = Photographs { doubts, ..Photographs::default() };
     for (mut cutout, before) in cutouts.into_iter().zip(unturned) {
         made.canvases.push(cutout.place(standing, side, placement)?);
         made.frames.push(cutout.frame);
@@ -141,4 +131,13 @@ fn unit(value: u8) -> f32 {
 /// A colour with channels in [0, 1].
 fn unit_color(pixel: &Rgb<u8>) -> Vec3 {
     Vec3::from(pixel.0.map(f32::from)) / 255.0
+}
+
+/// The median of each channel; `None` without colours.
+fn median(colors: &[Vec3]) -> Option<Vec3> {
+    let channel = |c: usize| {
+        let mut values: Vec<f32> = colors.iter().map(|color| color[c]).collect();
+        *values.select_nth_unstable_by(colors.len() / 2, f32::total_cmp).1
+    };
+    (!colors.is_empty()).then(|| Vec3::new(channel(0), channel(1), channel(2)))
 }

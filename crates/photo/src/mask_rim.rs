@@ -4,7 +4,7 @@
 use glam::Vec3;
 use image::{GrayImage, Rgb, RgbImage};
 
-use super::{INSIDE, unit_color};
+use super::{INSIDE, median, unit_color};
 use crate::rect::Rect;
 
 /// Width of the rim in pixels for a person of [`HEIGHT`] pixels. Masks too large by two thirds of it are corrected.
@@ -216,12 +216,7 @@ impl Colors {
     /// The outline's colour, if it is uniform and the person behind it has other colours.
     fn uniform(&self, rim: &Rim) -> Option<Vec3> {
         let outline = rim.pixels.iter().take_while(|at| rim.levels[**at] == 1).count();
-        let median = |channel: usize| {
-            let mut values: Vec<f32> = self.own[..outline].iter().map(|color| color[channel]).collect();
-            values.sort_unstable_by(f32::total_cmp);
-            values.get(outline / 2).copied()
-        };
-        let color = Vec3::new(median(0)?, median(1)?, median(2)?);
+        let color = median(&self.own[..outline])?;
         let share = |colors: &[Vec3]| {
             colors[..outline].iter().filter(|c| c.distance(color) < ALIKE).count() as f32 / outline as f32
         };
@@ -320,6 +315,13 @@ mod tests {
         mask.pixels().map(|share| f32::from(share.0[0]) / 255.0).sum()
     }
 
+    /// Colours and mask stay as they are.
+    fn stays(mut rgb: RgbImage, mut mask: GrayImage, what: &str) {
+        let same = (rgb.clone(), mask.clone());
+        assert_eq!(clean(&mut rgb, &mut mask), 0, "{what}");
+        assert!((rgb, mask) == same, "{what}");
+    }
+
     type Background = fn(u32, u32) -> Vec3;
     const BACKGROUNDS: [(&str, Background); 4] = [
         ("white", |_, _| Vec3::ONE),
@@ -367,10 +369,7 @@ mod tests {
     fn good_masks_and_small_ones_stay_as_they_are() {
         for (name, background) in BACKGROUNDS {
             for grown in [-3.0, -1.0, 0.0] {
-                let (mut rgb, mut mask) = (picture(background), mask(grown));
-                let same = (rgb.clone(), mask.clone());
-                assert_eq!(clean(&mut rgb, &mut mask), 0, "{name}, {grown}");
-                assert!((rgb, mask) == same, "{name}, {grown}");
+                stays(picture(background), mask(grown), &format!("{name}, {grown}"));
             }
         }
         // A person who is dark towards the outline, as under a lamp beside the camera, cut out over nothing.
@@ -381,13 +380,8 @@ mod tests {
             let lit = slope * 255.0 * person(x, y);
             pixel.0 = if outside(x, y) > 0.5 { [0; 3] } else { lit.to_array().map(|c| c.round() as u8) };
         }
-        let (mut rgb, mut exact) = (shaded.clone(), mask(0.0));
-        assert_eq!(clean(&mut rgb, &mut exact), 0);
-        assert!(rgb == shaded && exact == mask(0.0));
-        // A person in the background's colour.
-        let mut grown = mask(3.0);
-        let mut rgb = RgbImage::from_pixel(SIZE.0, SIZE.1, Rgb([250; 3]));
-        assert_eq!(clean(&mut rgb, &mut grown), 0);
+        stays(shaded, mask(0.0), "shaded");
+        stays(RgbImage::from_pixel(SIZE.0, SIZE.1, Rgb([250; 3])), mask(3.0), "the background's colour");
     }
 
     /// The right half of the mask is too large, the left is good and has a soft fringe. People who are small, or whose
@@ -432,17 +426,11 @@ mod tests {
         let only = |at: Option<(u32, u32)>| {
             GrayImage::from_fn(9, 300, |x, y| Luma([if at.is_none_or(|at| at == (x, y)) { 255 } else { 0 }]))
         };
-        for mut mask in [only(None), only(Some((0, 299))), GrayImage::new(9, 300), GrayImage::new(1, 1)] {
-            let same = mask.clone();
-            let mut rgb = RgbImage::from_fn(mask.width(), mask.height(), |x, y| Rgb([x as u8, y as u8, 7]));
-            assert_eq!(clean(&mut rgb, &mut mask), 0);
-            assert_eq!(mask, same);
+        // The last one is a photograph in place of a mask.
+        let noise = GrayImage::from_fn(700, 700, |x, y| Luma([((x * 37 + y * 101) % 251) as u8]));
+        for mask in [only(None), only(Some((0, 299))), GrayImage::new(9, 300), GrayImage::new(1, 1), noise] {
+            let rgb = |x: u32, y: u32| Rgb([x as u8, y as u8, (x ^ y) as u8]);
+            stays(RgbImage::from_fn(mask.width(), mask.height(), rgb), mask, "extreme");
         }
-        // A photograph in place of a mask.
-        let mut noise = GrayImage::from_fn(700, 700, |x, y| Luma([((x * 37 + y * 101) % 251) as u8]));
-        let same = noise.clone();
-        let mut rgb = RgbImage::from_fn(700, 700, |x, y| Rgb([x as u8, y as u8, (x ^ y) as u8]));
-        assert_eq!(clean(&mut rgb, &mut noise), 0);
-        assert_eq!(noise, same);
     }
 }

@@ -6,8 +6,8 @@ use glam::{Mat3, Vec3};
 use image::imageops::{self, FilterType};
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use snapsnap_base::bilinear::{Tap, taps};
+use snapsnap_net::u2net::SIDE;
 
-use super::segmenter::SIDE;
 use super::specks::{Pieces, pieces};
 use super::unit_color;
 use crate::mask_strokes::paint;

@@ -199,19 +199,12 @@ pub struct Person {
 }
 
 /// No Gaussian came out of photographs.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
+#[error("no Gaussian came out of these photographs")]
 pub struct NoGaussian {
     /// The steps of the networks.
     pub steps: Vec<Step>,
 }
-
-impl fmt::Display for NoGaussian {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "no Gaussian came out of these photographs")
-    }
-}
-
-impl std::error::Error for NoGaussian {}
 
 /// Makes the person in a front and a back photograph, restored to the real cameras and to its height. `stage` is
 /// called with the name of each module before it runs.

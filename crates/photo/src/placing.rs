@@ -141,21 +141,11 @@ pub(super) fn placed(
 
     // Colours are resized after multiplication by the mask, so that the background does not bleed into them.
     let premultiplied = |color, m| unit(color) * unit(m);
-    let [r, g, b, m] = planes(rgb, mask, touched, premultiplied, [high, wide], lanczos3);
-    let area = side * side;
-    let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
-    for y in (0..high).filter(|y| (0..side as i64).contains(&(y0 + *y as i64))) {
-        for x in (0..wide).filter(|x| (0..side as i64).contains(&(x0 + *x as i64))) {
-            let from = y * wide + x;
-            let to = (y0 + y as i64) as usize * side + (x0 + x as i64) as usize;
-            // Lanczos overshoots at edges.
-            let share = m[from].clamp(0.0, 1.0);
-            on_canvas[to] = share;
-            for (c, plane) in [&r, &g, &b].into_iter().enumerate() {
-                values[c * area + to] = 2.0 * plane[from].clamp(0.0, share) - share;
-            }
-        }
-    }
+    let mut planes = planes(rgb, mask, touched, premultiplied, [high, wide], lanczos3);
+    // Lanczos overshoots at edges.
+    planes[3].iter_mut().for_each(|share| *share = share.clamp(0.0, 1.0));
+    let color = |value: f32, share: f32| 2.0 * value.clamp(0.0, share) - share;
+    let (values, on_canvas) = pasted(&planes, [high, wide], [y0, x0], side, color);
     let place = Place { size: [width, height], at: [left, top], side };
     let canvas = Canvas::Scaled { together, scale, limited_by_width, place };
     (Photograph::new(values, on_canvas), mapping, canvas)
@@ -191,20 +181,10 @@ pub(super) fn placed_as_demo(
     let width = (scaled / 2 * 2).clamp(2.min(side), side / 2 * 2);
     let (left, top) = ((side - width) / 2, (side - height) / 2);
     let mapping = Mapping::of(person, [left, top], [width, height]);
-    let [r, g, b, m] = planes(rgb, mask, person, |color, _| unit(color), [height, width], bilinear);
-    let area = side * side;
-    let (mut values, mut on_canvas) = (vec![0.0; 3 * area], vec![0.0; area]);
-    for y in 0..height {
-        for x in 0..width {
-            let (from, to) = (y * width + x, (top + y) * side + left + x);
-            on_canvas[to] = m[from];
-            if m[from] >= Photograph::LEAST {
-                for (c, plane) in [&r, &g, &b].into_iter().enumerate() {
-                    values[c * area + to] = 2.0 * plane[from] - 1.0;
-                }
-            }
-        }
-    }
+    let planes = planes(rgb, mask, person, |color, _| unit(color), [height, width], bilinear);
+    let color = |value, share| if share >= Photograph::LEAST { 2.0 * value - 1.0 } else { 0.0 };
+    let place = [top as i64, left as i64];
+    let (values, on_canvas) = pasted(&planes, [height, width], place, side, color);
     let valid = on_canvas.iter().map(|m| *m >= 1.0).collect();
     let canvas = Canvas::Demo(Place { size: [width, height], at: [left, top], side });
     (Photograph { rgb: values, mask: on_canvas, valid }, mapping, canvas)
@@ -229,4 +209,28 @@ fn planes(
         };
         resize(places.map(value).collect(), [person.height as usize, person.width as usize], size)
     })
+}
+
+/// Colours `[3, S, S]` and mask `[S, S]` of an empty canvas of `side`² pixels, onto which `planes` of `size` (rows,
+/// columns) are pasted from the row and the column `place` on. `color` makes a colour of its value and its mask.
+fn pasted(
+    [r, g, b, m]: &[Vec<f32>; 4],
+    [high, wide]: [usize; 2],
+    [y0, x0]: [i64; 2],
+    side: usize,
+    color: impl Fn(f32, f32) -> f32,
+) -> (Vec<f32>, Vec<f32>) {
+    let area = side * side;
+    let (mut values, mut mask) = (vec![0.0; 3 * area], vec![0.0; area]);
+    for y in (0..high).filter(|y| (0..side as i64).contains(&(y0 + *y as i64))) {
+        for x in (0..wide).filter(|x| (0..side as i64).contains(&(x0 + *x as i64))) {
+            let from = y * wide + x;
+            let to = (y0 + y as i64) as usize * side + (x0 + x as i64) as usize;
+            mask[to] = m[from];
+            for (c, plane) in [r, g, b].into_iter().enumerate() {
+                values[c * area + to] = color(plane[from], m[from]);
+            }
+        }
+    }
+    (values, mask)
 }

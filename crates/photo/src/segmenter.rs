@@ -3,11 +3,8 @@
 use std::sync::{Mutex, OnceLock, PoisonError};
 
 use burn::tensor::Device;
-use snapsnap_net::u2net::{SIDE as NETWORK_SIDE, U2Net};
+use snapsnap_net::u2net::U2Net;
 use snapsnap_net::weights::Source;
-
-/// Side of the pictures that the network receives.
-pub const SIDE: usize = NETWORK_SIDE;
 
 const WEIGHTS: &[u8] = include_bytes!("../../../assets/weights/u2netp.safetensors");
 

@@ -8,32 +8,27 @@ use super::*;
 
 const SIDE: usize = 256;
 
-fn saved(picture: &RgbaImage) -> tempfile::NamedTempFile {
-    let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
-    picture.save(file.path()).expect("PNG");
-    file
-}
-
 /// A person of 40 × 80 pixels in a picture of 100 × 120: upper left red, upper right green, lower left blue, lower
 /// right white. The surroundings are bright, transparent noise.
-fn quarters() -> tempfile::NamedTempFile {
-    let picture =
-        RgbaImage::from_fn(100, 120, |x, y| match ((10..50).contains(&x), (30..110).contains(&y)) {
-            (true, true) => match (x < 30, y < 70) {
-                (true, true) => Rgba([255, 0, 0, 255]),
-                (false, true) => Rgba([0, 255, 0, 255]),
-                (true, false) => Rgba([0, 0, 255, 255]),
-                (false, false) => Rgba([255, 255, 255, 255]),
-            },
-            _ => Rgba([255, (x * 37) as u8, (y * 91) as u8, 0]),
-        });
-    saved(&picture)
+fn quarters() -> RgbaImage {
+    RgbaImage::from_fn(100, 120, |x, y| match ((10..50).contains(&x), (30..110).contains(&y)) {
+        (true, true) => match (x < 30, y < 70) {
+            (true, true) => Rgba([255, 0, 0, 255]),
+            (false, true) => Rgba([0, 255, 0, 255]),
+            (true, false) => Rgba([0, 0, 255, 255]),
+            (false, false) => Rgba([255, 255, 255, 255]),
+        },
+        _ => Rgba([255, (x * 37) as u8, (y * 91) as u8, 0]),
+    })
 }
 
-/// Canvas and report of a photograph that is both front and back.
-fn one(path: &Path, placement: Placement) -> Result<(Photograph, PhotoReport), FileError> {
-    let mut read = read(&[Source::file(path); 2], Cutting::Given, SIDE, placement, None)?;
-    Ok((read.canvases.remove(0), read.reports.remove(0)))
+/// Canvas and report of a person's photograph that is both front and back.
+fn one(picture: &RgbaImage, placement: Placement) -> (Photograph, PhotoReport) {
+    let file = tempfile::Builder::new().suffix(".png").tempfile().expect("temporary file");
+    picture.save(file.path()).expect("PNG");
+    let read = read(&[Source::file(file.path()); 2], Cutting::Given, SIDE, placement, None);
+    let mut read = read.expect("a person");
+    (read.canvases.remove(0), read.reports.remove(0))
 }
 
 fn check_quarters(canvas: &Photograph, rows: std::ops::Range<usize>) {
@@ -63,16 +58,10 @@ fn check_quarters(canvas: &Photograph, rows: std::ops::Range<usize>) {
 }
 
 #[test]
-fn the_person_stands_upright_where_training_subjects_stand() {
-    let (canvas, _) = one(quarters().path(), Placement::Training { height: 740 }).expect("a person");
+fn the_person_stands_upright_where_training_subjects_stand_or_in_the_demos_middle() {
     // 740 and the middle row 493.5 of 1024, at a quarter of the size.
-    check_quarters(&canvas, 31..216);
-}
-
-#[test]
-fn the_demo_puts_the_person_in_the_middle() {
-    let (canvas, _) = one(quarters().path(), Placement::Demo { height: 700 }).expect("a person");
-    check_quarters(&canvas, 40..215);
+    check_quarters(&one(&quarters(), Placement::Training { height: 740 }).0, 31..216);
+    check_quarters(&one(&quarters(), Placement::Demo { height: 700 }).0, 40..215);
 }
 
 #[test]
@@ -85,8 +74,7 @@ fn soft_edges_stay_soft_and_outside_the_box() {
         };
         Rgba([200, (x * 2) as u8, y as u8, alpha])
     });
-    let file = saved(&picture);
-    let (canvas, _) = one(file.path(), Placement::Training { height: 739 }).expect("a person");
+    let (canvas, _) = one(&picture, Placement::Training { height: 739 });
     let column: Vec<f32> = (0..SIDE).map(|row| canvas.mask[row * SIDE + SIDE / 2]).collect();
     let soft = column.iter().filter(|m| (0.3..0.5).contains(*m)).count();
     // Five rows of 100/255, enlarged by 739/4/120.
@@ -99,9 +87,8 @@ fn a_person_wider_than_the_canvas_gets_smaller_not_narrower() {
     let picture = RgbaImage::from_fn(400, 100, |x, y| {
         Rgba([x as u8, y as u8, 0, if (10..390).contains(&x) && (40..78).contains(&y) { 255 } else { 0 }])
     });
-    let file = saved(&picture);
     for placement in [Placement::Training { height: 739 }, Placement::Demo { height: 700 }] {
-        let (canvas, _) = one(file.path(), placement).expect("a person");
+        let (canvas, _) = one(&picture, placement);
         let rows = (0..SIDE).filter(|y| canvas.valid[y * SIDE + SIDE / 2]).count();
         let columns = canvas.valid.chunks_exact(SIDE).map(|r| r.iter().filter(|v| **v).count()).max();
         let ratio = columns.expect("rows") as f32 / rows as f32;
@@ -120,8 +107,7 @@ fn a_speck_far_from_a_tiny_person_costs_nothing() {
         };
         Rgba([(x % 256) as u8, (y % 256) as u8, 0, alpha])
     });
-    let file = saved(&picture);
-    let (canvas, _) = one(file.path(), Placement::Training { height: 739 }).expect("a person");
+    let (canvas, _) = one(&picture, Placement::Training { height: 739 });
     let valid = canvas.valid.iter().filter(|v| **v).count();
     assert!((170 * 170..200 * 200).contains(&valid), "{valid}");
 }
@@ -181,12 +167,11 @@ fn rims_of_the_background_are_left_out_of_a_users_photographs() {
         let area = SIDE * SIDE;
         (0..area).filter(|i| canvas.valid[*i] && canvas.rgb[area + i] > canvas.rgb[*i]).count()
     };
-    let file = saved(&picture);
-    let (corrected, report) = one(file.path(), Placement::Training { height: 880 }).expect("a person");
+    let (corrected, report) = one(&picture, Placement::Training { height: 880 });
     assert!(report.rim > 0 && report.to_string().contains("rim left out"), "{report}");
     assert_eq!(greenish(&corrected), 0);
     for placement in [Placement::AsIs, Placement::Demo { height: 880 }] {
-        let (canvas, report) = one(file.path(), placement).expect("a person");
+        let (canvas, report) = one(&picture, placement);
         assert!(greenish(&canvas) > 300 && report.rim == 0, "{placement:?}: {}", greenish(&canvas));
     }
     // Photographs in memory, as in training, are corrected as well.

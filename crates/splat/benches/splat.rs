@@ -53,10 +53,6 @@ fn leaf<const D: usize>(tensor: Tensor<D>, device: &Device, is_tracked: bool) ->
     if is_tracked { tensor.require_grad() } else { tensor }
 }
 
-fn cameras(count: usize, size: u32) -> Vec<Camera> {
-    (0..count).map(|i| Camera::orbit_at_yaw_degrees(i as f64 * 360.0 / count as f64, size)).collect()
-}
-
 /// Median time, and peak of host memory beyond the memory before the preparation.
 #[derive(Clone, Copy)]
 struct Figure {
@@ -96,14 +92,14 @@ struct Case {
 
 /// One line of the table.
 fn run(case: &Case, tracked: Tracked, device: &Device, on_host: bool) {
-    let cameras = cameras(case.views, case.size);
+    let cameras = Camera::orbit(case.views, case.size, case.size);
     let options = RenderOptions::inria();
     let gaussians = human(case.n, case.size, case.sigma, tracked, device);
     let counts = render(&gaussians, &cameras, &options).expect("rendered").counts;
     let forward = measure(device, || (), |()| render(&gaussians, &cameras, &options).expect("rendered"));
     let shape = [case.views, case.size as usize, case.size as usize, 3];
     let inner = gaussians.device();
-    let upstream = Tensor::<4>::ones(shape, &inner) * 0.5;
+    let upstream = Tensor::<4>::full(shape, 0.5, &inner);
     let backward = (tracked != Tracked::Nothing).then(|| {
         let prepare = || {
             let rendered = render(&gaussians, &cameras, &options).expect("rendered");
@@ -167,7 +163,7 @@ fn main() {
     };
     let commit = std::process::Command::new("git").args(["rev-parse", "--short", "HEAD"]).output();
     let commit = commit.ok().and_then(|o| String::from_utf8(o.stdout).ok()).unwrap_or_default();
-    println!("device {}, {} threads, commit {}", name, threads(), commit.trim());
+    println!("device {}, {} threads, commit {}", name, rayon::current_num_threads(), commit.trim());
     println!(
         "\n| N | image | V | σ, px | tracked | intersections | forward, ms | peak, MB | of budget | backward, ms | peak of both, MB | of budget |"
     );
@@ -190,8 +186,4 @@ fn main() {
             }
         }
     }
-}
-
-fn threads() -> usize {
-    std::thread::available_parallelism().map_or(1, usize::from)
 }

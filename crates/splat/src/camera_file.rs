@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::Path;
 
 use glam::{DMat3, DVec2, DVec3};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use snapsnap_base::file::{self, write_whole};
 use snapsnap_base::{FileError, quoted};
@@ -29,41 +29,36 @@ struct Entry {
 
 const FIELDS: [&str; 7] = ["width", "height", "fx", "fy", "cx", "cy", "world_to_camera"];
 
-impl Entry {
-    fn parse(value: &Value) -> Result<Self, String> {
-        let fields = value.as_object().ok_or("is no object with `width`, `height`, `fx`, …")?;
-        if let Some(unknown) = fields.keys().find(|key| !FIELDS.contains(&key.as_str())) {
-            return Err(format!("unknown field `{}`, expected {}", quoted(unknown), FIELDS.join(", ")));
-        }
-        let field = |name: &str| fields.get(name).ok_or_else(|| format!("`{name}` is missing"));
-        let number = |name: &str| field(name)?.as_f64().ok_or_else(|| format!("`{name}` is no number"));
-        let side = |name: &str| {
-            let side = field(name)?.as_u64().and_then(|side| side.try_into().ok());
-            side.ok_or_else(|| format!("`{name}` is no whole number of pixels"))
-        };
-        let matrix = || {
-            let rows = fields.get("world_to_camera")?.as_array()?;
-            let row = |row: &Value| -> Option<[f64; 4]> {
-                let numbers: Option<Vec<f64>> = row.as_array()?.iter().map(Value::as_f64).collect();
-                numbers?.try_into().ok()
-            };
-            let rows: Option<Vec<[f64; 4]>> = rows.iter().map(row).collect();
-            rows?.try_into().ok()
-        };
-        let world_to_camera = {
-            field("world_to_camera")?;
-            matrix().ok_or("`world_to_camera` is no list of 4 rows of 4 numbers")?
-        };
-        Ok(Self {
-            width: side("width")?,
-            height: side("height")?,
-            fx: number("fx")?,
-            fy: number("fy")?,
-            cx: number("cx")?,
-            cy: number("cy")?,
-            world_to_camera,
-        })
+/// The camera of an entry of the file.
+fn camera(entry: &Value) -> Result<Camera, String> {
+    let fields = entry.as_object().ok_or("is no object with `width`, `height`, `fx`, …")?;
+    if let Some(unknown) = fields.keys().find(|key| !FIELDS.contains(&key.as_str())) {
+        return Err(format!("unknown field `{}`, expected {}", quoted(unknown), FIELDS.join(", ")));
     }
+    let field = |name: &str| fields.get(name).ok_or_else(|| format!("`{name}` is missing"));
+    let number = |name: &str| field(name)?.as_f64().ok_or_else(|| format!("`{name}` is no number"));
+    let side = |name: &str| {
+        let side = field(name)?.as_u64().and_then(|side| side.try_into().ok());
+        side.ok_or_else(|| format!("`{name}` is no whole number of pixels"))
+    };
+    let [a, b, c, d] = <[[f64; 4]; 4]>::deserialize(field("world_to_camera")?)
+        .map_err(|_| "`world_to_camera` is no list of 4 rows of 4 numbers")?;
+    let row = |r: [f64; 4]| DVec3::new(r[0], r[1], r[2]);
+    let camera = Camera {
+        width: side("width")?,
+        height: side("height")?,
+        focal: DVec2::new(number("fx")?, number("fy")?),
+        principal_point: DVec2::new(number("cx")?, number("cy")?),
+        world_to_camera: RigidTransform {
+            rotation: DMat3::from_cols(row(a), row(b), row(c)).transpose(),
+            translation: DVec3::new(a[3], b[3], c[3]),
+        },
+    };
+    if d != [0.0, 0.0, 0.0, 1.0] {
+        return Err(format!("the last row of `world_to_camera` is {d:?}, expected [0, 0, 0, 1]"));
+    }
+    camera.check()?;
+    Ok(camera)
 }
 
 /// Reads the cameras of `path`.
@@ -87,29 +82,10 @@ pub fn parse(path: &Path, text: &str) -> Result<Vec<Camera>, FileError> {
     if entries.is_empty() {
         return Err(wrong("the list is empty".into()));
     }
-    let camera = |(index, value): (usize, Value)| {
-        let entry = Entry::parse(&value).map_err(|problem| wrong(format!("camera {index}: {problem}")))?;
-        let [a, b, c, d] = entry.world_to_camera;
-        if d != [0.0, 0.0, 0.0, 1.0] {
-            return Err(wrong(format!(
-                "camera {index}: the last row of `world_to_camera` is {d:?}, expected [0, 0, 0, 1]"
-            )));
-        }
-        let row = |r: [f64; 4]| DVec3::new(r[0], r[1], r[2]);
-        let camera = Camera {
-            width: entry.width,
-            height: entry.height,
-            focal: DVec2::new(entry.fx, entry.fy),
-            principal_point: DVec2::new(entry.cx, entry.cy),
-            world_to_camera: RigidTransform {
-                rotation: DMat3::from_cols(row(a), row(b), row(c)).transpose(),
-                translation: DVec3::new(a[3], b[3], c[3]),
-            },
-        };
-        camera.check().map_err(|problem| wrong(format!("camera {index}: {problem}")))?;
-        Ok(camera)
-    };
-    entries.into_iter().enumerate().map(camera).collect()
+    let cameras = entries.iter().enumerate();
+    cameras
+        .map(|(index, entry)| camera(entry).map_err(|problem| wrong(format!("camera {index}: {problem}"))))
+        .collect()
 }
 
 /// Writes `cameras` to `path`, whole or not at all.
@@ -145,13 +121,6 @@ pub fn write(cameras: &[Camera], path: &Path) -> Result<(), FileError> {
 mod tests {
     use super::*;
 
-    fn read_text(text: &str) -> Result<Vec<Camera>, FileError> {
-        let folder = tempfile::tempdir().expect("folder");
-        let path = folder.path().join("cameras.json");
-        std::fs::write(&path, text).expect("written");
-        read(&path)
-    }
-
     #[test]
     fn what_was_written_is_read_again() {
         let folder = tempfile::tempdir().expect("folder");
@@ -174,7 +143,8 @@ mod tests {
     fn errors_name_the_camera_and_the_field() {
         let good = r#"{"width":4,"height":4,"fx":1,"fy":1,"cx":2,"cy":2,
             "world_to_camera":[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#;
-        assert_eq!(read_text(&format!("[{good}]")).expect("good").len(), 1);
+        let parse = |text: &str| parse(Path::new("cameras.json"), text);
+        assert_eq!(parse(&format!("[{good}]")).expect("good").len(), 1);
         for (from, to, expected) in [
             (r#""width":4"#, r#""width":0"#, "camera 1: `width` is 0"),
             (r#""width":4"#, r#""width":-4"#, "camera 1: `width` is no whole number"),
@@ -189,10 +159,10 @@ mod tests {
             ("[1,0,0,0]", "[1,0,0,1e99]", "translation"),
         ] {
             let bad = good.replace(from, to);
-            let error = read_text(&format!("[{good},{bad}]")).expect_err(to).to_string();
+            let error = parse(&format!("[{good},{bad}]")).expect_err(to).to_string();
             assert!(error.contains("cameras.json") && error.contains(expected), "{to}: {error}");
         }
-        assert!(read_text("[]").expect_err("empty").to_string().contains("empty"));
-        assert!(read_text("{").expect_err("no JSON").to_string().contains("line 1"));
+        assert!(parse("[]").expect_err("empty").to_string().contains("empty"));
+        assert!(parse("{").expect_err("no JSON").to_string().contains("line 1"));
     }
 }

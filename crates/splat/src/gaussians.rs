@@ -122,19 +122,6 @@ fn times<const C: usize>(x: Tensor<2>, rows: &[[f32; C]]) -> Tensor<2> {
 mod tests {
     use super::*;
     use crate::Camera;
-    use burn::tensor::TensorData;
-
-    fn one(rotation: DQuat, mean: DVec3, device: &Device) -> Gaussians {
-        let row = |v: &[f64]| {
-            let v: Vec<f32> = v.iter().map(|&x| x as f32).collect();
-            let n = v.len();
-            Tensor::<2>::from_data(TensorData::new(v, [1, n]), device)
-        };
-        let q = row(&[rotation.w, rotation.x, rotation.y, rotation.z]);
-        let ones = Tensor::<2>::ones([1, 3], device);
-        Gaussians::new(row(&mean.to_array()), q, ones.clone(), Tensor::ones([1], device), ones)
-            .expect("shapes")
-    }
 
     #[test]
     fn transforming_rotates_the_covariance_with_the_means() {
@@ -142,7 +129,11 @@ mod tests {
         let q = DQuat::from_axis_angle(DVec3::new(1.0, 2.0, -0.5).normalize(), 0.7);
         let mean = DVec3::new(0.3, -0.2, 2.1);
         let transform = Camera::orbit_at_yaw_degrees(40.0, 64).world_to_camera.inverse();
-        let moved = one(q, mean, &device).transformed(&transform);
+        let ones = Tensor::<2>::ones([1, 3], &device);
+        let means = Tensor::from_floats([mean.as_vec3().to_array()], &device);
+        let rotations = Tensor::from_floats([[q.w, q.x, q.y, q.z].map(|v| v as f32)], &device);
+        let one = Gaussians::new(means, rotations, ones.clone(), Tensor::ones([1], &device), ones);
+        let moved = one.expect("shapes").transformed(&transform);
         let r: Vec<f32> = moved.rotations.into_data().try_into_vec().expect("f32");
         let got = DMat3::from_quat(DQuat::from_xyzw(r[1].into(), r[2].into(), r[3].into(), r[0].into()));
         let expected = transform.rotation * DMat3::from_quat(q);

@@ -9,7 +9,7 @@ use std::io::{self, Read, Write};
 use serde_json::{Map, Value, json};
 
 use crate::sh;
-use crate::stored::{MIN_SCALE, Problem, Stored, logit, opacity, unit};
+use crate::stored::{COEFFICIENTS, MIN_SCALE, Problem, Stored, logit, opacity, unit};
 
 /// First bytes of a file.
 pub(crate) const MAGIC: [u8; 2] = *b"gl";
@@ -24,8 +24,6 @@ const FLOAT: u32 = 5126;
 const MAX_LENGTH: u64 = u32::MAX as u64;
 /// Largest JSON chunk that is read, in bytes. Written ones have four kilobytes.
 const MAX_JSON: u32 = 16 << 20;
-/// Numbers of SH coefficients up to degree 0, 1, 2 and 3.
-const COEFFICIENTS: [usize; 4] = [1, 4, 9, 16];
 /// Largest deviation of a node's transform from the identity, per number.
 const MOVED: f64 = 1e-9;
 
@@ -181,14 +179,13 @@ impl File<'_> {
             primitives.iter().filter(|p| p["extensions"].get(EXTENSION).is_some()).map(move |p| (mesh, p))
         });
         let found: Vec<(usize, &Value)> = with_splats.collect();
-        let [(mesh, primitive)] = found[..] else {
-            let message =
-                format!("it has {} primitives with {EXTENSION}; files with one are read", found.len());
-            return Err(if found.is_empty() {
-                format!("it has no Gaussians ({EXTENSION})")
-            } else {
-                message
-            });
+        let (mesh, primitive) = match found[..] {
+            [] => return Err(format!("it has no Gaussians ({EXTENSION})")),
+            [one] => one,
+            [..] => {
+                let count = found.len();
+                return Err(format!("it has {count} primitives with {EXTENSION}; files with one are read"));
+            }
         };
         if primitive["extensions"][EXTENSION]["extensions"].is_object() {
             return Err("its Gaussians are compressed by another extension".into());
@@ -221,12 +218,8 @@ impl File<'_> {
         };
         add(&positions, 3, &[0, 1, 2], |v| v);
         add(&read(&named("ROTATION"), 4)?, 4, &[3, 0, 1, 2], |v| v);
-        add(
-            &read(&named("SCALE"), 3)?,
-            3,
-            &[0, 1, 2],
-            |v| if v < MIN_SCALE { MIN_SCALE.ln() } else { v.ln() },
-        );
+        let log = |v: f32| if v < MIN_SCALE { MIN_SCALE.ln() } else { v.ln() };
+        add(&read(&named("SCALE"), 3)?, 3, &[0, 1, 2], log);
         add(&read(&named("OPACITY"), 1)?, 1, &[0], logit);
         let bands: Result<Vec<Vec<f32>>, String> =
             (0..coefficients).map(|band| read(&named(&coefficient(band)), 3)).collect();

@@ -49,6 +49,12 @@ pub fn combine(f: f32, a: &Vec3, g: f32, b: &Vec3) -> Vec3 {
     Vec3 { x: f * a.x + g * b.x, y: f * a.y + g * b.y, z: f * a.z + g * b.z }
 }
 
+/// f·a·b, component by component.
+#[cube]
+pub fn multiply(f: f32, a: &Vec3, b: &Vec3) -> Vec3 {
+    Vec3 { x: f * a.x * b.x, y: f * a.y * b.y, z: f * a.z * b.z }
+}
+
 /// M·a.
 #[cube]
 pub fn times(m: &Mat3, a: &Vec3) -> Vec3 {

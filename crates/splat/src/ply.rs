@@ -12,7 +12,7 @@ pub(crate) use read::read;
 
 /// Properties of one vertex of SH degree 0, in INRIA's order; higher degrees add `f_rest_*` after `f_dc_2`. Missing
 /// degrees are not written: every known viewer reads them as zero, and 45 zeros would triple the file.
-pub const PROPERTIES: [&str; 17] = [
+const PROPERTIES: [&str; 17] = [
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1",
     "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
 ];

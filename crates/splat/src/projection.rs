@@ -40,7 +40,7 @@ use bytemuck::NoUninit;
 use cubecl::prelude::*;
 
 use crate::linear::{
-    Mat3, Quat, Vec3, combine, cross, dot, product, rotation_matrix, times, transposed_product,
+    Mat3, Quat, Vec3, combine, cross, dot, multiply, product, rotation_matrix, times, transposed_product,
     transposed_times,
 };
 
@@ -175,16 +175,8 @@ pub fn project(view: &View, t: &Vec3, rotation: &Quat, scale: &Vec3, blur: f32) 
     let q = Quat { w: p.w / norm, x: p.x / norm, y: p.y / norm, z: p.z / norm };
 
     let axes = product(&view.rotation, &rotation_matrix(&q));
-    let m0 = Vec3 {
-        x: jx * (axes.r0.x - x * axes.r2.x) * scale.x,
-        y: jx * (axes.r0.y - x * axes.r2.y) * scale.y,
-        z: jx * (axes.r0.z - x * axes.r2.z) * scale.z,
-    };
-    let m1 = Vec3 {
-        x: jy * (axes.r1.x - y * axes.r2.x) * scale.x,
-        y: jy * (axes.r1.y - y * axes.r2.y) * scale.y,
-        z: jy * (axes.r1.z - y * axes.r2.z) * scale.z,
-    };
+    let m0 = multiply(jx, &combine(1.0, &axes.r0, -x, &axes.r2), scale);
+    let m1 = multiply(jy, &combine(1.0, &axes.r1, -y, &axes.r2), scale);
     let first = m0.x.abs().max(m0.y.abs()).max(m0.z.abs());
     let second = m1.x.abs().max(m1.y.abs()).max(m1.z.abs());
     let unit = first.max(second).max(1.0);
@@ -311,24 +303,12 @@ pub fn project_vjp(
     let v_m1 = combine(f.l1, &q1, 1.0 / p.unit, &twos);
 
     // Rows of J·A and their gradients, entry by entry.
-    let h0 = Vec3 {
-        x: p.axes.r0.x - p.x * p.axes.r2.x,
-        y: p.axes.r0.y - p.x * p.axes.r2.y,
-        z: p.axes.r0.z - p.x * p.axes.r2.z,
-    };
-    let h1 = Vec3 {
-        x: p.axes.r1.x - p.y * p.axes.r2.x,
-        y: p.axes.r1.y - p.y * p.axes.r2.y,
-        z: p.axes.r1.z - p.y * p.axes.r2.z,
-    };
-    let v_scale = Vec3 {
-        x: v_m0.x * p.jx * h0.x + v_m1.x * p.jy * h1.x,
-        y: v_m0.y * p.jx * h0.y + v_m1.y * p.jy * h1.y,
-        z: v_m0.z * p.jx * h0.z + v_m1.z * p.jy * h1.z,
-    };
+    let h0 = combine(1.0, &p.axes.r0, -p.x, &p.axes.r2);
+    let h1 = combine(1.0, &p.axes.r1, -p.y, &p.axes.r2);
+    let v_scale = combine(1.0, &multiply(p.jx, &v_m0, &h0), 1.0, &multiply(p.jy, &v_m1, &h1));
     // v_h0/jx and v_h1/jy. The factors jx and jy are applied below.
-    let w0 = Vec3 { x: v_m0.x * scale.x, y: v_m0.y * scale.y, z: v_m0.z * scale.z };
-    let w1 = Vec3 { x: v_m1.x * scale.x, y: v_m1.y * scale.y, z: v_m1.z * scale.z };
+    let w0 = multiply(1.0, &v_m0, scale);
+    let w1 = multiply(1.0, &v_m1, scale);
     let v_jx = dot(&w0, &h0);
     let v_jy = dot(&w1, &h1);
     let v_axes = Mat3 {

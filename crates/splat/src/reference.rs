@@ -146,24 +146,8 @@ impl<T: Copy> Scene<T> {
     }
 }
 
-/// One pixel.
-#[derive(Clone, Copy, Debug)]
-pub struct Pixel<T> {
-    /// Red, green, blue.
-    pub color: [T; 3],
-    /// 1 − T_final.
-    pub alpha: T,
-    /// Σ t_z·α·T.
-    pub depth: T,
-}
-
-impl<T: Copy> Pixel<T> {
-    /// Red, green, blue, alpha, depth.
-    pub fn channels(&self) -> [T; 5] {
-        let [r, g, b] = self.color;
-        [r, g, b, self.alpha, self.depth]
-    }
-}
+/// Red, green, blue, alpha (1 − T_final), depth (Σ t_z·α·T).
+pub type Pixel<T> = [T; 5];
 
 /// Cut-off of splats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -182,8 +166,8 @@ struct Splat<T> {
     /// Σ'⁻¹: xx, xy, yy.
     conic: [T; 3],
     opacity: T,
-    color: [T; 3],
-    depth: T,
+    /// Red, green, blue, depth.
+    values: [T; 4],
 }
 
 /// Renders `scene` into `camera`, row by row.
@@ -215,7 +199,7 @@ fn splats<T: Number>(scene: &Scene<T>, camera: &Camera, options: &RenderOptions)
     let rows = scene.gaussians.iter().enumerate();
     let mut splats: Vec<Splat<T>> = rows.filter_map(|(i, g)| splat(i, g, camera, options)).collect();
     // A stable sort: ties stay in input order.
-    splats.sort_by(|a, b| a.depth.value().total_cmp(&b.depth.value()));
+    splats.sort_by(|a, b| a.values[3].value().total_cmp(&b.values[3].value()));
     splats
 }
 
@@ -310,8 +294,7 @@ fn splat<T: Number>(index: usize, g: &[T; 14], camera: &Camera, options: &Render
         centre: [n(f.x) * t[0] / t[2] + n(c.x), n(f.y) * t[1] / t[2] + n(c.y)],
         conic: [yy / determinant, -xy / determinant, xx / determinant],
         opacity,
-        color: [red, green, blue],
-        depth: t[2],
+        values: [red, green, blue, t[2]],
     })
 }
 
@@ -326,7 +309,7 @@ fn composite<T: Number>(
 ) -> Pixel<T> {
     let n = T::new;
     let (least, closed) = (f64::from(MIN_ALPHA), f64::from(MIN_TRANSMITTANCE));
-    let mut out = Pixel { color: [n(0.0); 3], alpha: n(0.0), depth: n(0.0) };
+    let mut sums = [n(0.0); 4];
     let mut transmittance = n(1.0);
     for splat in splats {
         let d = [n(pixel[0]) - splat.centre[0], n(pixel[1]) - splat.centre[1]];
@@ -356,20 +339,19 @@ fn composite<T: Number>(
         }
         take(splat.index, is_clamped);
         let weight = alpha * transmittance;
-        for (sum, color) in out.color.iter_mut().zip(splat.color) {
-            *sum = *sum + color * weight;
+        for (sum, value) in sums.iter_mut().zip(splat.values) {
+            *sum = *sum + value * weight;
         }
-        out.depth = out.depth + splat.depth * weight;
         transmittance = next;
     }
-    for (sum, color) in out.color.iter_mut().zip(background) {
+    for (sum, color) in sums.iter_mut().zip(background) {
         *sum = *sum + color * transmittance;
     }
-    out.alpha = n(1.0) - transmittance;
-    out
+    let [red, green, blue, depth] = sums;
+    [red, green, blue, n(1.0) - transmittance, depth]
 }
 
-/// Gradient of Σ ⟨pixel channels, `upstream`⟩ with respect to every number of `scene`.
+/// Gradient of Σ ⟨pixel, `upstream`⟩ with respect to every number of `scene`.
 pub fn gradient(
     scene: &Scene<f64>,
     camera: &Camera,
@@ -387,7 +369,7 @@ pub fn gradient(
         });
         let mut sum = [0.0; K];
         for (pixel, upstream) in render(&seeded, camera, options, cutoff).iter().zip(upstream) {
-            for (channel, weight) in pixel.channels().iter().zip(upstream) {
+            for (channel, weight) in pixel.iter().zip(upstream) {
                 sum.iter_mut().zip(channel.parts).for_each(|(s, p)| *s += weight * p);
             }
         }

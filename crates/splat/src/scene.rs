@@ -112,9 +112,8 @@ impl Stored {
     /// Losses beyond the usual quantisation of this kind of file, one sentence each.
     pub fn losses(&self, kind: Kind) -> Vec<String> {
         match kind {
-            Kind::Ply => Vec::new(),
+            Kind::Ply | Kind::Glb => Vec::new(),
             Kind::Spz => spz::losses(self),
-            Kind::Glb => Vec::new(),
             Kind::Sog => sog::losses(self),
         }
     }

@@ -80,15 +80,15 @@ fn harmonics(x: &Tensor<2>, y: &Tensor<2>, z: &Tensor<2>, k: usize) -> Vec<Tenso
 #[cfg(test)]
 mod tests {
     use burn::tensor::{Device, TensorData};
-    use glam::{DMat3, DVec2, DVec3};
+    use glam::{DVec2, DVec3};
 
     use super::*;
     use crate::RigidTransform;
 
     /// A camera at the origin.
     fn camera() -> Camera {
-        let world_to_camera = RigidTransform { rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
         let (focal, principal_point) = (DVec2::ONE, DVec2::ZERO);
+        let world_to_camera = RigidTransform::IDENTITY;
         Camera { width: 1, height: 1, focal, principal_point, world_to_camera }
     }
 
@@ -101,20 +101,17 @@ mod tests {
         let mut rows = vec![[0.0; 16]; n];
         for k in 0..16 {
             // A large constant coefficient, so that no colour is clamped at 0.
-            let mut unit = vec![0.0_f32; n * 16 * 3];
-            for i in 0..n {
-                unit[(i * 16 + k) * 3] = 1.0;
-                unit[(i * 16) * 3 + 1] = 10.0;
-                unit[(i * 16 + k) * 3 + 1] += 1.0;
-            }
-            let coefficients = Tensor::<3>::from_data(TensorData::new(unit, [n, 16, 3]), &device);
+            let mut unit = [0.0_f32; 16 * 3];
+            unit[0] = 10.0;
+            unit[3 * k] += 1.0;
+            let coefficients = Tensor::<3>::from_data(TensorData::new(unit.repeat(n), [n, 16, 3]), &device);
             let found: Vec<f32> = colors(&coefficients, &means, &camera())
                 .expect("shapes")
                 .into_data()
                 .try_into_vec()
                 .expect("f32");
-            for i in 0..n {
-                rows[i][k] = f64::from(found[3 * i + 1]) - 0.5 - 10.0 * f64::from(C0);
+            for (row, color) in rows.iter_mut().zip(found.chunks_exact(3)) {
+                row[k] = f64::from(color[0]) - 0.5 - 10.0 * f64::from(C0);
             }
         }
         rows
@@ -147,29 +144,27 @@ mod tests {
     #[test]
     fn order_and_signs_are_those_of_the_files() {
         let rows = table(&[DVec3::X, DVec3::Y, DVec3::Z, DVec3::new(1.0, 1.0, 1.0)]);
-        let check = |row: usize, k: usize, expected: f64| {
-            assert!(
-                (rows[row][k] - expected).abs() < 1e-5,
-                "direction {row}, harmonic {k}: {}",
-                rows[row][k]
-            );
-        };
-        check(0, 3, -0.488_602_5);
-        check(1, 1, -0.488_602_5);
-        check(2, 2, 0.488_602_5);
-        check(0, 8, 0.546_274_2);
-        check(2, 6, 2.0 * 0.315_391_6);
-        check(0, 15, -0.590_043_6);
-        check(1, 9, 0.590_043_6);
-        check(2, 12, 2.0 * 0.373_176_3);
-        // At (1,1,1)/√3 the products are ⅓ and 3^{-3/2}.
-        check(3, 4, 1.092_548_4 / 3.0);
-        check(3, 5, -1.092_548_4 / 3.0);
-        check(3, 7, -1.092_548_4 / 3.0);
-        check(3, 10, 2.890_611_4 / 27.0_f64.sqrt());
-        check(3, 11, -2.0 * 0.457_045_8 / 27.0_f64.sqrt());
-        check(3, 13, -2.0 * 0.457_045_8 / 27.0_f64.sqrt());
-        check(3, 14, 0.0);
+        for (row, k, expected) in [
+            (0, 3, -0.488_602_5),
+            (1, 1, -0.488_602_5),
+            (2, 2, 0.488_602_5),
+            (0, 8, 0.546_274_2),
+            (2, 6, 2.0 * 0.315_391_6),
+            (0, 15, -0.590_043_6),
+            (1, 9, 0.590_043_6),
+            (2, 12, 2.0 * 0.373_176_3),
+            // At (1,1,1)/√3 the products are ⅓ and 3^{-3/2}.
+            (3, 4, 1.092_548_4 / 3.0),
+            (3, 5, -1.092_548_4 / 3.0),
+            (3, 7, -1.092_548_4 / 3.0),
+            (3, 10, 2.890_611_4 / 27.0_f64.sqrt()),
+            (3, 11, -2.0 * 0.457_045_8 / 27.0_f64.sqrt()),
+            (3, 13, -2.0 * 0.457_045_8 / 27.0_f64.sqrt()),
+            (3, 14, 0.0),
+        ] {
+            let found: f64 = rows[row][k];
+            assert!((found - expected).abs() < 1e-5, "direction {row}, harmonic {k}: {found}");
+        }
     }
 
     #[test]

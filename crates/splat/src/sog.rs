@@ -40,11 +40,10 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
 
 /// Losses beyond quantisation, a sentence each.
 pub(crate) fn losses(stored: &Stored) -> Vec<String> {
-    let degree = stored.degree();
-    (degree > 0)
-        .then(|| format!("SH of degree {degree} became degree 0, as in every SOG of this program"))
-        .into_iter()
-        .collect()
+    match stored.degree() {
+        0 => Vec::new(),
+        degree => vec![format!("SH of degree {degree} became degree 0, as in every SOG of this program")],
+    }
 }
 
 /// Writes a SOG of Gaussians that [`check`] accepts.

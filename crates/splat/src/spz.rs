@@ -12,7 +12,7 @@ use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 
-use crate::stored::{Problem, Stored, unit};
+use crate::stored::{COEFFICIENTS, Problem, Stored, unit};
 
 /// First bytes of a gzip stream.
 pub(crate) const GZIP: [u8; 2] = [0x1f, 0x8b];
@@ -27,6 +27,8 @@ const MAX_POINTS: usize = 10_000_000;
 /// of equal Gaussians keep a rasteriser busy for minutes. Real files decompress to up to 5 times their size.
 const MAX_CONTENT: u64 = 1 << 20;
 const MAX_RATIO: u64 = 100;
+/// Most bytes of extensions that are read.
+const EXTENSIONS: u64 = 1 << 24;
 /// Fractional bits of coordinates, if they fit: steps of a quarter of a millimetre up to 2 km.
 const FRACTIONAL_BITS: u8 = 12;
 /// Largest coordinate in 24 bits.
@@ -35,13 +37,11 @@ const MAX_FIXED: f64 = 8_388_607.0;
 const COLOR_SCALE: f32 = 0.15;
 /// Quantisation steps of SH coefficients of degree 1 and above 1, as in Niantic's library. Coarse steps compress well.
 const SH_STEPS: [i32; 2] = [8, 16];
-/// Values per channel of SH degrees 0 to 4.
-const COEFFICIENTS: [usize; 5] = [1, 4, 9, 16, 25];
 
 /// Reads a gzip stream of `length` bytes.
 pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
-    let mut input = Bytes { input: GzDecoder::new(input) };
-    let header = input.take(16, "the header")?;
+    let mut input = GzDecoder::new(input);
+    let header = take(&mut input, 16, "the header")?;
     let word = |at: usize| u32::from_le_bytes([header[at], header[at + 1], header[at + 2], header[at + 3]]);
     if word(0) != MAGIC {
         return Err("a gzip stream, but no SPZ in it (its magic is missing)".to_owned().into());
@@ -55,12 +55,14 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
         return Err(format!("{n} Gaussians; SPZ files have {MAX_POINTS} at most").into());
     }
     let [degree, bits] = [header[12], header[13]];
-    let Some(&there) = COEFFICIENTS.get(usize::from(degree)) else {
+    if degree > 4 {
         return Err(format!("SH of degree {degree}; an SPZ has 0 to 4").into());
-    };
+    }
     if bits > 24 {
         return Err(format!("coordinates with {bits} fractional bits; 24 are possible").into());
     }
+    // Values per channel.
+    let there = (usize::from(degree) + 1).pow(2);
     let size = if version == VERSION { 4 } else { 3 };
     let centre = if version == 1 { 6 } else { 9 };
     let content = (n * (centre + 7 + size + 3 * (there - 1))) as u64;
@@ -75,13 +77,13 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
     let mut columns = Vec::with_capacity(Stored::COLUMNS.len() + 3 * (coefficients - 1));
 
     if version == 1 {
-        let halves = input.take(6 * n, "centres")?;
+        let halves = take(&mut input, 6 * n, "centres")?;
         for axis in 0..3 {
             let half = |p: &[u8]| f16::from_le_bytes([p[2 * axis], p[2 * axis + 1]]).to_f32();
             columns.push(halves.chunks_exact(6).map(half).collect());
         }
     } else {
-        let fixed = input.take(9 * n, "centres")?;
+        let fixed = take(&mut input, 9 * n, "centres")?;
         let unit = f64::from(bits).exp2().recip();
         for axis in 0..3 {
             let value = |p: &[u8]| {
@@ -92,10 +94,10 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
             columns.push(fixed.chunks_exact(9).map(value).collect());
         }
     }
-    let opacities: Vec<f32> = input.take(n, "opacities")?.iter().map(|&a| logit(a)).collect();
-    let colors = input.take(3 * n, "colours")?;
-    let scales = input.take(3 * n, "scales")?;
-    let rotations = input.take(size * n, "rotations")?;
+    let opacities: Vec<f32> = take(&mut input, n, "opacities")?.iter().map(|&a| logit(a)).collect();
+    let colors = take(&mut input, 3 * n, "colours")?;
+    let scales = take(&mut input, 3 * n, "scales")?;
+    let rotations = take(&mut input, size * n, "rotations")?;
     let mut quaternions = [(); 4].map(|()| Vec::with_capacity(n));
     for packed in rotations.chunks_exact(size) {
         let q = match *packed {
@@ -115,7 +117,7 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
     }
     if there > 1 {
         let stride = 3 * (there - 1);
-        let bands = input.take(stride * n, "spherical harmonics")?;
+        let bands = take(&mut input, stride * n, "spherical harmonics")?;
         for channel in 0..3 {
             for band in 0..coefficients - 1 {
                 let value = |s: &[u8]| (f32::from(s[3 * band + channel]) - 128.0) / 128.0;
@@ -123,7 +125,9 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
             }
         }
     }
-    input.finish()?;
+    // Read to the end, so that the decoder verifies the checksum. Extensions after the Gaussians are skipped; if they
+    // are longer than `EXTENSIONS` bytes, the rest is not read.
+    io::copy(&mut input.take(EXTENSIONS), &mut io::sink()).map_err(damaged)?;
     Ok(Stored { coefficients, columns })
 }
 
@@ -223,30 +227,14 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
     out.finish().map(drop)
 }
 
-/// The decompressed stream. Memory grows with the data, not with the header's promises.
-struct Bytes<R> {
-    input: R,
-}
-
-impl<R: Read> Bytes<R> {
-    fn take(&mut self, length: usize, what: &str) -> Result<Vec<u8>, Problem> {
-        let mut bytes = Vec::new();
-        (&mut self.input).take(length as u64).read_to_end(&mut bytes).map_err(damaged)?;
-        if bytes.len() < length {
-            return Err(
-                format!("the file ends too early: {} of {length} bytes of {what}", bytes.len()).into()
-            );
-        }
-        Ok(bytes)
+/// The next bytes of the decompressed stream. Memory grows with the data, not with the header's promises.
+fn take(input: &mut impl Read, length: usize, what: &str) -> Result<Vec<u8>, Problem> {
+    let mut bytes = Vec::new();
+    input.take(length as u64).read_to_end(&mut bytes).map_err(damaged)?;
+    if bytes.len() < length {
+        return Err(format!("the file ends too early: {} of {length} bytes of {what}", bytes.len()).into());
     }
-
-    /// Reads to the end, so that the decoder verifies the checksum. Extensions after the Gaussians are skipped; if
-    /// they are longer than `EXTENSIONS` bytes, the rest is not read.
-    fn finish(&mut self) -> Result<(), Problem> {
-        const EXTENSIONS: u64 = 1 << 24;
-        io::copy(&mut (&mut self.input).take(EXTENSIONS), &mut io::sink()).map_err(damaged)?;
-        Ok(())
-    }
+    Ok(bytes)
 }
 
 /// The problem of a read error: a stream that is cut or has a wrong checksum is a damaged file, no failing disk.
@@ -306,12 +294,8 @@ fn unpack_smallest_three(mut packed: u32) -> [f32; 4] {
 fn pack_smallest_three(wxyz: [f32; 4]) -> u32 {
     let [w, x, y, z] = unit(wxyz);
     let q = [x, y, z, w];
-    let mut largest = 0;
-    for i in 1..4 {
-        if q[i].abs() > q[largest].abs() {
-            largest = i;
-        }
-    }
+    // The first of equal components.
+    let largest = (0..4).rev().max_by(|a, b| q[*a].abs().total_cmp(&q[*b].abs())).expect("four components");
     let others = (0..4).filter(|&i| i != largest);
     others.fold(largest as u32, |packed, i| {
         let size = (COMPONENT as f32 * q[i].abs() / std::f32::consts::FRAC_1_SQRT_2 + 0.5) as u32;

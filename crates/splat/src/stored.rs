@@ -11,6 +11,9 @@ const OPACITY_MARGIN: f32 = 1e-6;
 /// Least scale that is stored, metres: the logarithm of a scale that underflowed to 0 is infinite.
 pub(crate) const MIN_SCALE: f32 = 1e-10;
 
+/// Numbers of SH coefficients per channel up to degree 0, 1, 2 and 3.
+pub(crate) const COEFFICIENTS: [usize; 4] = [1, 4, 9, 16];
+
 /// The Gaussians of a file on a device.
 #[derive(Debug, Clone)]
 pub struct Loaded {
@@ -26,13 +29,11 @@ impl Loaded {
     /// # Errors
     /// [`SplatError::Shape`] if the number of coefficients belongs to no SH degree.
     pub fn seen_by(&self, camera: &Camera) -> Result<Gaussians, SplatError> {
-        let gaussians = self.gaussians.clone();
-        match &self.harmonics {
-            None => Ok(gaussians),
-            Some(harmonics) => {
-                Ok(Gaussians { colors: sh::colors(harmonics, &gaussians.means, camera)?, ..gaussians })
-            }
+        let mut gaussians = self.gaussians.clone();
+        if let Some(harmonics) = &self.harmonics {
+            gaussians.colors = sh::colors(harmonics, &gaussians.means, camera)?;
         }
+        Ok(gaussians)
     }
 }
 
@@ -122,14 +123,11 @@ impl Stored {
     pub fn drop_not_finite(&mut self) -> usize {
         let whole = |i: usize| self.columns.iter().all(|column| column[i].is_finite());
         let kept: Vec<bool> = (0..self.len()).map(whole).collect();
-        let dropped = kept.iter().filter(|kept| !**kept).count();
-        if dropped > 0 {
-            for column in &mut self.columns {
-                let mut kept = kept.iter();
-                column.retain(|_| *kept.next().expect("as long as the columns"));
-            }
+        for column in &mut self.columns {
+            let mut kept = kept.iter();
+            column.retain(|_| *kept.next().expect("as long as the columns"));
         }
-        dropped
+        kept.len() - self.len()
     }
 
     /// Activates the Gaussians and uploads them to `device`. Values that are not finite are kept; a render culls them.
@@ -162,15 +160,12 @@ impl Stored {
 }
 
 /// Reason why a file cannot be read.
+#[derive(Debug, thiserror::Error)]
 pub(crate) enum Problem {
-    Io(io::Error),
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    #[error("{0}")]
     Content(String),
-}
-
-impl From<io::Error> for Problem {
-    fn from(e: io::Error) -> Self {
-        Self::Io(e)
-    }
 }
 
 impl From<String> for Problem {

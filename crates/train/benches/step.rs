@@ -14,7 +14,6 @@ use burn::tensor::{Device, Distribution, Tensor};
 use snapsnap_base::config::Schema;
 use snapsnap_net::network::{Input, PointPredictor};
 use snapsnap_net::precision::Precision;
-use snapsnap_net::regressor::Statistics;
 use snapsnap_net::weights::{NamedVisitor, ParameterPath, random_predictor, random_regressors, visit_named};
 use snapsnap_train::config::TrainConfig;
 
@@ -24,22 +23,14 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 /// Forward and backward, the fastest of all repetitions.
 fn measure(seconds: f64, mut step: impl FnMut() -> (Duration, Duration)) -> String {
     step();
-    let end = Instant::now() + Duration::from_secs_f64(seconds);
-    let (mut best, mut count) = ((Duration::MAX, Duration::ZERO), 0);
-    while Instant::now() < end || count < 3 {
-        let times = step();
-        count += 1;
-        if times.0 + times.1 < best.0.saturating_add(best.1) {
-            best = times;
-        }
+    let (end, mut times) = (Instant::now() + Duration::from_secs_f64(seconds), Vec::new());
+    while Instant::now() < end || times.len() < 3 {
+        let (forward, backward) = step();
+        times.push([forward + backward, forward, backward]);
     }
-    let ms = |time: Duration| time.as_secs_f64() * 1e3;
-    format!(
-        "forward {:.0} + backward {:.0} = {:.0} ms, {count} runs",
-        ms(best.0),
-        ms(best.1),
-        ms(best.0 + best.1)
-    )
+    let fastest = times.iter().min().expect("at least three runs");
+    let [both, forward, backward] = fastest.map(|time| time.as_secs_f64() * 1e3);
+    format!("forward {forward:.0} + backward {backward:.0} = {both:.0} ms, {} runs", times.len())
 }
 
 fn main() {
@@ -139,7 +130,7 @@ fn run(seconds: f64, side: usize, batch: usize) {
     let input = Tensor::<4>::random([2, 6, side, side], Distribution::Uniform(-1.0, 1.0), &device);
     let time = measure(seconds, || {
         let start = Instant::now();
-        let loss = regressor.forward(input.clone(), &mut Statistics::measured()).square().mean();
+        let loss = regressor.forward(input.clone()).square().mean();
         let forward = start.elapsed();
         black_box(GradientsParams::from_grads(loss.backward(), &regressor));
         (forward, start.elapsed() - forward)

@@ -7,7 +7,8 @@ use std::path::Path;
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use snapsnap_base::FileError;
-use snapsnap_net::weights::{Float, Source, WeightsError, not_finite, write_tensors};
+use snapsnap_net::config::Precision;
+use snapsnap_net::weights::{Source, WeightsError, not_finite, write_tensors};
 use snapsnap_ops::host;
 
 use crate::identity::Identity;
@@ -48,7 +49,7 @@ pub(crate) fn save<T: Task>(
     // Only one row at a time is copied to the host.
     let rows: Vec<_> = rows.into_values().collect();
     let values = |i: usize| Ok(host(rows[i].clone()));
-    write_tensors(path, "the state of the training", metadata, names, Float::F32, values, &|_, _| ())
+    write_tensors(path, "the state of the training", metadata, names, Precision::F32, values, &|_, _| ())
 }
 
 /// Restores a learner of the same networks from the state of a run, and returns the run's identity.

@@ -21,7 +21,7 @@ pub struct Data<I> {
     /// Samples that are the same in every validation, from the data sets with the configured split.
     validation: ComposedDataset<Stage<I>>,
     /// Number of samples of a validation.
-    pub(crate) count: usize,
+    pub count: usize,
 }
 
 impl<I: Clone + Send + Sync + 'static> Data<I> {

@@ -12,17 +12,12 @@ const PIECE: usize = 1 << 14;
 /// An exponential moving average.
 pub struct Average {
     /// Share of the average that a step keeps, after the first steps.
-    decay: f64,
+    pub decay: f64,
     /// The averages.
     pub rows: Rows,
 }
 
 impl Average {
-    /// Begins with `rows`.
-    pub fn new(decay: f64, rows: Rows) -> Self {
-        Self { decay, rows }
-    }
-
     /// Adds the weights after `step` steps. The first steps keep less of the average, since it is mostly the initial
     /// weights.
     pub fn update(&mut self, step: u64, rows: Rows) {

@@ -23,16 +23,9 @@ pub enum TrainError {
     /// Settings that do not fit one another or the data.
     #[error("{0}")]
     Unsuitable(String),
-    /// Another rank cannot continue.
-    #[error("rank {rank} on {host}: {why}")]
-    Elsewhere {
-        /// Its number.
-        rank: usize,
-        /// Its machine.
-        host: String,
-        /// Its error.
-        why: String,
-    },
+    /// Another rank cannot continue. The message has its number, its machine and its error.
+    #[error("{0}")]
+    Elsewhere(String),
     /// Too many failed steps in a row.
     #[error("{count} steps in a row could not be made; the last was step {step}: {why}")]
     Stuck {

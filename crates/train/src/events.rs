@@ -23,30 +23,28 @@ impl Events {
 
     /// Adds the values of a step.
     pub fn add(&mut self, step: u64, values: &BTreeMap<String, f64>) -> io::Result<()> {
-        self.summary(step, |summary| {
-            for (name, value) in values {
-                let mut entry = Vec::new();
-                text(&mut entry, 1, name.as_bytes());
-                // Field 2, four bytes.
-                entry.push(2 << 3 | 5);
-                entry.extend((*value as f32).to_le_bytes());
-                text(summary, 1, &entry);
-            }
-        })
+        let mut summary = Vec::new();
+        for (name, value) in values {
+            let mut entry = Vec::new();
+            text(&mut entry, 1, name.as_bytes());
+            // Field 2, four bytes.
+            entry.push(2 << 3 | 5);
+            entry.extend((*value as f32).to_le_bytes());
+            text(&mut summary, 1, &entry);
+        }
+        self.summary(step, &summary)
     }
 
-    fn summary(&mut self, step: u64, fill: impl FnOnce(&mut Vec<u8>)) -> io::Result<()> {
-        let mut summary = Vec::new();
-        fill(&mut summary);
+    fn summary(&mut self, step: u64, summary: &[u8]) -> io::Result<()> {
         let mut event = now();
         event.push(2 << 3);
         varint(&mut event, step);
-        text(&mut event, 5, &summary);
+        text(&mut event, 5, summary);
         self.record(&event)
     }
 
-    /// Adds a PNG of `size` (width, height) to a step.
-    pub fn add_picture(&mut self, step: u64, name: &str, size: (u32, u32), png: &[u8]) -> io::Result<()> {
+    /// Adds a PNG of `size` (width, height) to a step, named `preview`.
+    pub fn add_preview(&mut self, step: u64, size: (u32, u32), png: &[u8]) -> io::Result<()> {
         // Height, width, number of channels, bytes.
         let mut picture = Vec::new();
         for (field, value) in [(1, size.1), (2, size.0), (3, 3)] {
@@ -54,10 +52,11 @@ impl Events {
             varint(&mut picture, value.into());
         }
         text(&mut picture, 4, png);
-        let mut entry = Vec::new();
-        text(&mut entry, 1, name.as_bytes());
+        let (mut entry, mut summary) = (Vec::new(), Vec::new());
+        text(&mut entry, 1, b"preview");
         text(&mut entry, 4, &picture);
-        self.summary(step, |summary| text(summary, 1, &entry))
+        text(&mut summary, 1, &entry);
+        self.summary(step, &summary)
     }
 
     fn record(&mut self, data: &[u8]) -> io::Result<()> {
@@ -99,14 +98,8 @@ fn masked(crc: u32) -> u32 {
 
 /// Castagnoli's checksum.
 fn crc32c(bytes: &[u8]) -> u32 {
-    let byte = |crc: u32, byte: &u8| {
-        (0..8).fold(
-            crc ^ u32::from(*byte),
-            |crc, _| {
-                if crc & 1 == 1 { crc >> 1 ^ 0x82f6_3b78 } else { crc >> 1 }
-            },
-        )
-    };
+    let bit = |crc: u32, _: u8| if crc & 1 == 1 { crc >> 1 ^ 0x82f6_3b78 } else { crc >> 1 };
+    let byte = |crc: u32, byte: &u8| (0..8).fold(crc ^ u32::from(*byte), bit);
     !bytes.iter().fold(!0, byte)
 }
 

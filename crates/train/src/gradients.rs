@@ -7,7 +7,7 @@ use burn::tensor::{Device, Gradients, Tensor};
 use snapsnap_net::weights::{NamedVisitor, ParameterPath};
 use snapsnap_ops::host;
 
-use crate::networks::{Networks, Rows, moved, row};
+use crate::networks::{Networks, Rows, moved, split};
 use crate::ranks::Ranks;
 
 /// The gradients of all parameters that have one.
@@ -38,7 +38,7 @@ pub fn reduce(
 ) -> Rows {
     /// Values that are summed at once.
     const BUCKET: usize = 1 << 22;
-    if ranks.size() == 1 {
+    if ranks.size == 1 {
         return moved(gradients, device);
     }
     let present: Vec<bool> = lengths.keys().map(|name| gradients.contains_key(name)).collect();
@@ -48,18 +48,12 @@ pub fn reduce(
     let (mut bucket, mut inside) = (Vec::new(), Vec::new());
     for (place, (name, length)) in lengths.iter().enumerate() {
         if is_present(place) {
-            let values = gradients.remove(name).map_or_else(|| vec![0.0; *length], host);
-            bucket.extend(values);
-            inside.push((name, *length));
+            bucket.extend(gradients.remove(name).map_or_else(|| vec![0.0; *length], host));
+            inside.push((name.clone(), *length));
         }
         if !inside.is_empty() && (bucket.len() >= BUCKET || place + 1 == lengths.len()) {
             ranks.sum(&mut bucket);
-            let mut rest = &bucket[..];
-            for (name, length) in inside.drain(..) {
-                let (values, others) = rest.split_at(length);
-                sums.insert(name.clone(), row(values.to_vec(), device));
-                rest = others;
-            }
+            sums.extend(split(std::mem::take(&mut inside), &bucket, device));
             bucket.clear();
         }
     }

@@ -80,8 +80,7 @@ impl Identity {
 
     /// Differences from the identity `there`.
     pub fn differences(&self, there: &Self) -> Vec<String> {
-        let [harmful, harmless] = self.sorted(there);
-        harmful.into_iter().chain(harmless).collect()
+        self.sorted(there).concat()
     }
 
     /// Differences from the identity `there`: of the networks, and of everything else.

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use burn::data::dataset::Dataset;
+use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -15,7 +16,6 @@ use crate::ema::Average;
 use crate::identity::Identity;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
-use crate::precision::lower;
 use crate::ranks::Ranks;
 use crate::task::{Moment, Task};
 use crate::{TrainError, gradients};
@@ -58,7 +58,11 @@ pub(crate) struct Learner<'a, T: Task> {
     device: &'a Device,
     /// Number of values of each parameter.
     lengths: BTreeMap<String, usize>,
-    samples: Samples<'a, T>,
+    /// Number of samples of a pass.
+    in_pass: usize,
+    /// This rank's parts of the batches of the current pass, and the number of the next one since the beginning of the
+    /// run.
+    open: Option<(Batches<T::Item>, u64)>,
 }
 
 /// Reason of a skipped step, with its samples.
@@ -78,14 +82,15 @@ impl<'a, T: Task> Learner<'a, T> {
         Self {
             task,
             config,
-            average: (share > 0.0).then(|| Average::new(share, networks.rows())),
+            average: (share > 0.0).then(|| Average { decay: share, rows: networks.rows() }),
             optimizer: config.optimizer.init(config.mode.compat),
             lengths: lengths.collect(),
             networks,
             progress: Progress { stage: T::STAGE, ..Progress::default() },
             ranks,
             device,
-            samples: Samples::new(task, config),
+            in_pass: task.data().pass(0).len(),
+            open: None,
         }
     }
 
@@ -103,7 +108,7 @@ impl<'a, T: Task> Learner<'a, T> {
     /// # Errors
     /// [`TrainError::Unsuitable`] if not.
     pub fn compare(&self, identity: &Identity) -> Result<(), TrainError> {
-        if self.ranks.size() == 1 {
+        if self.ranks.size == 1 {
             return Ok(());
         }
         let mut hash = Sha256::new();
@@ -113,7 +118,7 @@ impl<'a, T: Task> Learner<'a, T> {
         // A run may change these keys between sessions, but all ranks need the same values.
         let t = &self.config.training;
         let times = [t.steps, t.validate_every, t.checkpoint_every, t.preview_every];
-        let own = (identity.clone(), times, format!("{:x}", hash.finalize()), self.ranks.host().to_owned());
+        let own = (identity.clone(), times, format!("{:x}", hash.finalize()), self.ranks.host.clone());
         let all = self.ranks.gather(&own);
         let (first, times, hash, host) = &all[0];
         for (rank, (there, other_times, other_hash, other_host)) in all.iter().enumerate() {
@@ -166,18 +171,14 @@ impl<'a, T: Task> Learner<'a, T> {
             // A scene that the rasteriser refuses costs the step, not the run.
             Err(TrainError::Splat(e)) => (Err(e.to_string()), None),
             Err(e) => (Err(String::new()), Some(e)),
-            Ok(Made { gradients: None, .. }) => (Err("the loss is not finite".to_owned()), None),
-            Ok(Made { values, gradients: Some(gradients) }) => (Ok((values, gradients)), None),
+            Ok(made) => (made, None),
         };
         self.ranks.agree(failed)?;
-        let (named, sum) = match made {
-            Ok((values, gradients)) => {
-                let named = values.into_iter().map(|(name, value)| (name.to_owned(), value));
-                (Ok(named.collect::<BTreeMap<_, _>>()), gradients)
-            }
+        let (own, sum) = match made {
+            Ok((values, gradients)) => (Ok(values), gradients),
             Err(why) => (Err(of_samples(&why, &names)), Rows::new()),
         };
-        let everywhere = match self.ranks.gather(&named).into_iter().collect::<Result<Vec<_>, Skipped>>() {
+        let everywhere = match self.ranks.gather(&own).into_iter().collect::<Result<Vec<_>, Skipped>>() {
             Ok(everywhere) => everywhere,
             Err(why) => return Ok(Err(why)),
         };
@@ -191,7 +192,7 @@ impl<'a, T: Task> Learner<'a, T> {
         let since = Instant::now();
         let device = self.optimizer.device(self.device.clone().inner());
         let sum = gradients::reduce(self.ranks, sum, &self.lengths, &device);
-        if self.ranks.size() > 1 {
+        if self.ranks.size > 1 {
             values.insert("reduce_ms".to_owned(), 1e3 * since.elapsed().as_secs_f64());
         }
         let norm = gradients::norm(&sum);
@@ -216,38 +217,55 @@ impl<'a, T: Task> Learner<'a, T> {
 
     /// Losses and gradients of a part of a batch, times the part's share of the batch.
     fn losses(&self, items: Vec<T::Item>, at: Moment, share: f64) -> Result<Made, TrainError> {
-        let nothing = Made { values: BTreeMap::new(), gradients: Some(Rows::new()) };
+        let nothing = Ok((BTreeMap::new(), Rows::new()));
         // There may be more ranks than samples in the last batch of a pass.
         if items.is_empty() {
             return Ok(nothing);
         }
-        let parts = self.task.losses(&lower(self.config.training.precision, &self.networks), items, at)?;
+        let parts =
+            self.task.losses(&self.networks.in_precision(self.config.training.precision), items, at)?;
         if parts.is_empty() {
             return Ok(nothing);
         }
         let read = host(Tensor::cat(parts.iter().map(|part| part.value.clone()).collect(), 0));
         let (mut values, mut total) = (BTreeMap::new(), 0.0);
         for (part, value) in parts.iter().zip(read) {
-            values.insert(part.name, share * f64::from(value));
+            values.insert(part.name.to_owned(), share * f64::from(value));
             total += part.weight * f64::from(value);
         }
-        values.insert("loss", share * total);
+        values.insert("loss".to_owned(), share * total);
         if !total.is_finite() {
-            return Ok(Made { values, gradients: None });
+            return Ok(Err("the loss is not finite".to_owned()));
         }
         let weighted = parts.into_iter().map(|part| part.value * (part.weight * share)).collect();
         let mut tracked = Tensor::cat(weighted, 0).sum().backward();
-        Ok(Made { values, gradients: Some(gradients::collect(&self.networks, &mut tracked)) })
+        Ok(Ok((values, gradients::collect(&self.networks, &mut tracked))))
     }
 
-    /// This rank's part of a batch of the run, or the reason why any rank cannot load its part.
+    /// This rank's part of a batch by its number since the beginning of the run, or the reason why any rank cannot load
+    /// its part. The content of a batch follows from its number alone.
     fn load(&mut self, number: u64) -> Result<Loaded<T::Item>, Skipped> {
-        let loaded = self.samples.get(number, self.ranks);
-        let reasons = self.ranks.gather(&loaded.as_ref().err().cloned());
-        match reasons.into_iter().flatten().next() {
-            Some(why) => Err(why),
-            None => loaded,
+        let (t, ranks) = (&self.config.training, self.ranks);
+        let per_pass = self.in_pass.div_ceil(t.batch).max(1) as u64;
+        let (pass, place) = (number / per_pass, (number % per_pass) as usize);
+        let mut open = self.open.take().filter(|(_, next)| *next == number && place > 0);
+        let (batches, next) = open.get_or_insert_with(|| {
+            let loader = Loader::new(self.task.data().pass(pass), t.batch, t.workers, PREFETCH);
+            let loader = loader.part(ranks.rank, ranks.size);
+            // The published code takes people in order.
+            let loader = if self.config.mode.compat { loader } else { loader.shuffled(t.seed) };
+            (loader.batches(pass, place), number)
+        });
+        *next += 1;
+        let made = batches.next().ok_or_else(|| "the data ended early".to_owned());
+        let made = made.and_then(|items| items.map_err(|e| e.to_string()));
+        self.open = open;
+        let reasons = ranks.gather(&made.as_ref().err().cloned());
+        if let Some(why) = reasons.into_iter().flatten().next() {
+            return Err(why);
         }
+        let count = t.batch.min(self.in_pass - place * t.batch);
+        Ok(Loaded { items: made?, first: ranks.share(count).start, count })
     }
 }
 
@@ -255,12 +273,9 @@ fn of_samples(why: &str, names: &[String]) -> Skipped {
     format!("{why} (samples: {})", names.join("; "))
 }
 
-/// Result of a batch: the loss and its parts by name, none if no sample shows a person; and the gradients, unless a
-/// loss was not finite.
-struct Made {
-    values: BTreeMap<&'static str, f64>,
-    gradients: Option<Rows>,
-}
+/// Result of a batch: the loss and its parts by name, none if no sample shows a person; and the gradients. Or the reason
+/// why the step is skipped, without its samples.
+type Made = Result<(BTreeMap<String, f64>, Rows), String>;
 
 /// Samples of this rank's part of a batch.
 struct Loaded<I> {
@@ -269,42 +284,4 @@ struct Loaded<I> {
     first: usize,
     /// Number of samples of the whole batch.
     count: usize,
-}
-
-/// This rank's parts of the batches of all passes.
-struct Samples<'a, T: Task> {
-    task: &'a T,
-    config: &'a TrainConfig,
-    /// Number of samples of a pass.
-    in_pass: usize,
-    /// The current pass, and the number of its next batch since the beginning of the run.
-    open: Option<(Batches<T::Item>, u64)>,
-}
-
-impl<'a, T: Task> Samples<'a, T> {
-    fn new(task: &'a T, config: &'a TrainConfig) -> Self {
-        Self { task, config, in_pass: task.data().pass(0).len(), open: None }
-    }
-
-    /// A batch by its number since the beginning of the run, or the reason why it cannot be loaded. Its content follows
-    /// from the number alone.
-    fn get(&mut self, number: u64, ranks: &Ranks) -> Result<Loaded<T::Item>, String> {
-        let t = &self.config.training;
-        let per_pass = self.in_pass.div_ceil(t.batch).max(1) as u64;
-        let (pass, place) = (number / per_pass, (number % per_pass) as usize);
-        let mut open = self.open.take().filter(|(_, next)| *next == number && place > 0);
-        let (batches, next) = open.get_or_insert_with(|| {
-            let loader = Loader::new(self.task.data().pass(pass), t.batch, t.workers, PREFETCH);
-            let loader = loader.part(ranks.rank(), ranks.size());
-            // The published code takes people in order.
-            let loader = if self.config.mode.compat { loader } else { loader.shuffled(t.seed) };
-            (loader.batches(pass, place), number)
-        });
-        *next += 1;
-        let made = batches.next();
-        self.open = open;
-        let items = made.ok_or("the data ended early")?.map_err(|e| e.to_string())?;
-        let count = t.batch.min(self.in_pass - place * t.batch);
-        Ok(Loaded { items, first: ranks.share(count).start, count })
-    }
 }

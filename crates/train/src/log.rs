@@ -20,8 +20,6 @@ const MOST_BYTES: u64 = 1 << 30;
 
 /// Folder of previews, named by their steps.
 pub const PREVIEWS: &str = "previews";
-/// Name of previews in TensorBoard.
-const PREVIEW: &str = "preview";
 
 /// One line of `log.jsonl`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -73,7 +71,7 @@ impl Log {
         for (at, path) in previews(&folder.join(PREVIEWS), step) {
             // A missing or damaged preview does not stop the run.
             if let (Ok(size), Ok(png)) = (image::image_dimensions(&path), std::fs::read(&path)) {
-                events.add_picture(at, PREVIEW, size, &png).map_err(FileError::write(&events_path))?;
+                events.add_preview(at, size, &png).map_err(FileError::write(&events_path))?;
             }
         }
         Ok(Self { path, file: appended, events, lines })
@@ -113,7 +111,7 @@ impl Log {
     /// [`FileError`] if the file cannot be written.
     pub fn add_preview(&mut self, step: u64, size: (u32, u32), png: &[u8]) -> Result<(), FileError> {
         let path = self.path.with_file_name(EVENTS);
-        self.events.add_picture(step, PREVIEW, size, png).map_err(FileError::write(&path))
+        self.events.add_preview(step, size, png).map_err(FileError::write(&path))
     }
 
     /// Adds a line.

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, TensorData};
+use snapsnap_net::config::Precision;
 use snapsnap_net::network::PointPredictor;
 use snapsnap_net::regressor::Regressor;
 use snapsnap_net::weights::schema::SIDE;
@@ -53,9 +54,13 @@ impl Networks {
         }
     }
 
-    /// The same networks without gradients.
-    pub fn valid(&self) -> Self {
-        Module::valid(self)
+    /// The same networks with a predictor in this precision: its matrix products, its convolutions, and their
+    /// intermediate results for the backward pass. Gradients flow back to these networks. Weights, moments and losses
+    /// stay in 32 bits.
+    pub fn in_precision(&self, precision: Precision) -> Self {
+        let mut networks = self.clone();
+        networks.predictor = networks.predictor.map(|predictor| precision.lower(predictor));
+        networks
     }
 
     /// All parameters with their values, without gradients.
@@ -124,18 +129,20 @@ pub(crate) fn row(values: Vec<f32>, device: &Device) -> Tensor<1> {
     Tensor::from_data(TensorData::new(values, [count]), device)
 }
 
+/// Rows with these names and lengths, whose values stand one after the other.
+pub(crate) fn split(names: Vec<(String, usize)>, mut values: &[f32], device: &Device) -> Rows {
+    let one = |(name, length)| {
+        let own = values.split_off(..length).expect("as many values as were joined");
+        (name, row(own.to_vec(), device))
+    };
+    names.into_iter().map(one).collect()
+}
+
 /// Rows on a device, in one transfer.
 pub(crate) fn moved(rows: Rows, device: &Device) -> Rows {
     if rows.values().next().is_none_or(|first| first.device() == *device) {
         return rows;
     }
-    let (names, values): (Vec<String>, Vec<Tensor<1>>) = rows.into_iter().unzip();
-    let lengths: Vec<usize> = values.iter().map(|values| values.dims()[0]).collect();
-    let all = host(Tensor::cat(values, 0));
-    let mut rest = &all[..];
-    let one = |(name, length)| {
-        let values = rest.split_off(..length).expect("as many values as were joined");
-        (name, row(values.to_vec(), device))
-    };
-    names.into_iter().zip(lengths).map(one).collect()
+    let names = rows.iter().map(|(name, values)| (name.clone(), values.dims()[0])).collect();
+    split(names, &host(Tensor::cat(rows.into_values().collect(), 0)), device)
 }

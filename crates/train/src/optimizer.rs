@@ -120,7 +120,17 @@ impl Optimizer {
         });
         let work: Vec<_> = work.collect();
         let one = |(name, shape, values, gradient, state): (String, Vec<usize>, _, _, _)| {
-            let (values, state) = self.step_one(share, &name, &shape, values, gradient, factor, state);
+            let (values, state) = match &self.config.muon {
+                Some(settings) if is_hidden(&name, shape.len()) => {
+                    // Kernels `[out, in, k, k]` become matrices `[out, in·k·k]`.
+                    let size = [shape[0], shape[1..].iter().product()];
+                    muon(settings, share, values, gradient, factor, state, size)
+                }
+                _ => {
+                    let decays = shape.len() >= 2 || self.decays_all;
+                    self.adamw(share, decays, values, gradient, factor, state)
+                }
+            };
             (name, values, state)
         };
         // Parameters are many and small. On the CPU, cores share them. Other devices order work by the calling thread.
@@ -134,35 +144,6 @@ impl Optimizer {
             self.states.insert(name, state);
         }
         rows
-    }
-
-    #[allow(clippy::too_many_arguments, reason = "a parameter and its step")]
-    fn step_one(
-        &self,
-        share: f64,
-        name: &str,
-        shape: &[usize],
-        values: Tensor<1>,
-        gradient: Tensor<1>,
-        factor: f64,
-        state: Option<State>,
-    ) -> (Tensor<1>, State) {
-        match &self.config.muon {
-            Some(settings) if is_hidden(name, shape.len()) => {
-                let velocity = match state {
-                    Some(State::Muon { velocity }) => Some(velocity),
-                    _ => None,
-                };
-                // Kernels `[out, in, k, k]` become matrices `[out, in·k·k]`.
-                let size = [shape[0], shape[1..].iter().product()];
-                let (values, velocity) = muon(settings, share, values, gradient, factor, velocity, size);
-                (values, State::Muon { velocity })
-            }
-            _ => {
-                let decays = shape.len() >= 2 || self.decays_all;
-                self.adamw(share, decays, values, gradient, factor, state)
-            }
-        }
     }
 
     /// AdamW (Loshchilov and Hutter). Burn's AdamW corrects the moments' bias in f32, so that its second step differs
@@ -256,7 +237,7 @@ impl Optimizer {
     }
 }
 
-/// Muon (Jordan et al.): values and velocity after a step along the orthogonalised Nesterov momentum. The factor
+/// Muon (Jordan et al.): values and state after a step along the orthogonalised Nesterov momentum. The factor
 /// 0.2·√(longest side) makes the step as long as one of AdamW (Liu et al., "Muon is scalable"). On the host.
 fn muon(
     settings: &MuonSettings,
@@ -264,14 +245,17 @@ fn muon(
     values: Tensor<1>,
     gradient: Tensor<1>,
     factor: f64,
-    velocity: Option<Tensor<1>>,
+    state: Option<State>,
     [rows, columns]: [usize; 2],
-) -> (Tensor<1>, Tensor<1>) {
+) -> (Tensor<1>, State) {
     let device = values.device();
     let rate = share * settings.rate;
     let kept = 1.0 - rate * MUON_WEIGHT_DECAY;
     let pace = rate * 0.2 * (rows.max(columns) as f64).sqrt();
-    let mut velocity = velocity.map_or_else(|| vec![0.0; rows * columns], host);
+    let mut velocity = match state {
+        Some(State::Muon { velocity }) => host(velocity),
+        _ => vec![0.0; rows * columns],
+    };
     let (mut values, mut direction) = (host(values), host(gradient));
     let [momentum, factor, kept, pace] = [MUON_MOMENTUM, factor, kept, pace].map(|value| value as f32);
     for (velocity, gradient) in velocity.iter_mut().zip(&mut direction) {
@@ -281,7 +265,7 @@ fn muon(
     }
     let update = orthogonalised(direction, [rows, columns]);
     values.iter_mut().zip(update).for_each(|(value, update)| *value = *value * kept - update * pace);
-    (row(values, &device), row(velocity, &device))
+    (row(values, &device), State::Muon { velocity: row(velocity, &device) })
 }
 
 #[cfg(test)]
@@ -321,13 +305,13 @@ mod tests {
         for size in [[6, 10], [24, 7]] {
             let random = || Tensor::<2>::random(size, Distribution::Normal(0.0, 1.0), &device);
             let mut values = random();
-            let (mut ours, mut velocity, mut theirs) = (values.clone().reshape([-1]), None, None);
+            let (mut ours, mut own, mut theirs) = (values.clone().reshape([-1]), None, None);
             for _ in 0..3 {
                 let gradient = random();
                 let (new, state) = burns.step(0.01, values, gradient.clone(), theirs);
                 (values, theirs) = (new, state);
-                let (new, state) = muon(&settings, 1.0, ours, gradient.reshape([-1]), 1.0, velocity, size);
-                (ours, velocity) = (new, Some(state));
+                let (new, state) = muon(&settings, 1.0, ours, gradient.reshape([-1]), 1.0, own, size);
+                (ours, own) = (new, Some(state));
             }
             let (ours, theirs) = (host(ours), host(values));
             let apart = ours.iter().zip(&theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

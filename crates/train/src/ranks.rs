@@ -16,12 +16,14 @@ const SIZES: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TA
 
 /// The place of this process among those of its training.
 pub struct Ranks {
-    rank: usize,
-    size: usize,
+    /// This process among all: 0 is the first.
+    pub rank: usize,
+    /// Number of processes.
+    pub size: usize,
     /// Number of lower ranks on the same machine.
-    local: usize,
+    pub local: usize,
     /// Name of the machine.
-    host: String,
+    pub host: String,
     /// Ends MPI when it is dropped.
     #[cfg(feature = "mpi")]
     _universe: Option<mpi::environment::Universe>,
@@ -68,26 +70,6 @@ impl Ranks {
         ))
     }
 
-    /// This process among all: 0 is the first.
-    pub fn rank(&self) -> usize {
-        self.rank
-    }
-
-    /// Number of processes.
-    pub fn size(&self) -> usize {
-        self.size
-    }
-
-    /// Number of lower ranks on the same machine.
-    pub fn local(&self) -> usize {
-        self.local
-    }
-
-    /// Name of the machine.
-    pub fn host(&self) -> &str {
-        &self.host
-    }
-
     /// Whether this process writes the training's files and messages.
     pub fn is_first(&self) -> bool {
         self.rank == 0
@@ -122,7 +104,9 @@ impl Ranks {
             self.gather(&own).into_iter().enumerate().find_map(|(rank, failure)| Some((rank, failure?)));
         match (failed, first) {
             (Some(own), _) => Err(own),
-            (None, Some((rank, (why, host)))) => Err(TrainError::Elsewhere { rank, host, why }),
+            (None, Some((rank, (why, host)))) => {
+                Err(TrainError::Elsewhere(format!("rank {rank} on {host}: {why}")))
+            }
             (None, None) => Ok(()),
         }
     }
@@ -164,10 +148,6 @@ mod over_mpi {
 
     use super::Ranks;
 
-    fn world() -> SimpleCommunicator {
-        SimpleCommunicator::world()
-    }
-
     impl Ranks {
         pub(super) fn join_launched(launcher: &str) -> Result<Self, String> {
             let cannot = |why: &str| format!("{launcher} is set, but MPI cannot be started: {why}");
@@ -177,7 +157,7 @@ mod over_mpi {
             if threading < Threading::Serialized {
                 return Err(cannot("it does not support threads"));
             }
-            let world = world();
+            let world = SimpleCommunicator::world();
             let [rank, size] = [world.rank(), world.size()].map(|number| number as usize);
             let local = world.split_shared(world.rank()).rank() as usize;
             let host = processor_name().unwrap_or_default();
@@ -187,7 +167,8 @@ mod over_mpi {
         pub(super) fn exchange(&self, bytes: &[u8]) -> Vec<Vec<u8>> {
             let mut counts = vec![0_i32; self.size];
             let own = i32::try_from(bytes.len()).expect("short texts");
-            world().all_gather_into(&own, &mut counts[..]);
+            let world = SimpleCommunicator::world();
+            world.all_gather_into(&own, &mut counts[..]);
             let starts: Vec<i32> = counts
                 .iter()
                 .scan(0, |sum, count| {
@@ -198,7 +179,7 @@ mod over_mpi {
                 .collect();
             let mut all = vec![0_u8; counts.iter().sum::<i32>() as usize];
             let mut parts = PartitionMut::new(&mut all[..], counts.as_slice(), starts.as_slice());
-            world().all_gather_varcount_into(bytes, &mut parts);
+            world.all_gather_varcount_into(bytes, &mut parts);
             let part = |(start, count): (&i32, &i32)| all[*start as usize..(start + count) as usize].to_vec();
             starts.iter().zip(&counts).map(part).collect()
         }
@@ -212,19 +193,20 @@ mod over_mpi {
             let mut sent = values.to_vec();
             sent.resize(part * self.size, 0.0);
             let mut received = vec![0.0_f32; part * self.size];
-            world().all_to_all_into(&sent[..], &mut received[..]);
+            let world = SimpleCommunicator::world();
+            world.all_to_all_into(&sent[..], &mut received[..]);
             let (sum, others) = received.split_at_mut(part);
             for other in others.chunks_exact(part) {
                 sum.iter_mut().zip(other).for_each(|(sum, value)| *sum += value);
             }
-            world().all_gather_into(&*sum, &mut sent[..]);
+            world.all_gather_into(&*sum, &mut sent[..]);
             values.copy_from_slice(&sent[..values.len()]);
         }
 
         /// Ends all ranks with this exit code. Does nothing in a process alone.
         pub fn abort(&self, code: u8) {
             if self.size > 1 {
-                world().abort(code.into());
+                SimpleCommunicator::world().abort(code.into());
             }
         }
     }
@@ -237,16 +219,14 @@ mod tests {
     #[test]
     fn a_process_alone_has_everything() {
         let alone = Ranks::default();
-        assert!(alone.is_first() && alone.size() == 1 && alone.share(7) == (0..7));
+        assert!(alone.is_first() && alone.size == 1 && alone.share(7) == (0..7));
         assert_eq!(alone.gather(&vec![(1, "a".to_owned())]), [vec![(1, "a".to_owned())]]);
         let message = rmp_serde::to_vec(&(f64::INFINITY, f64::NAN)).expect("plain data");
         let (infinite, nan): (f64, f64) = rmp_serde::from_slice(&message).expect("what was sent");
         assert!(infinite == f64::INFINITY && nan.is_nan());
         assert!(alone.agree(None).is_ok());
-        assert!(matches!(
-            alone.agree(Some(TrainError::Unsuitable("x".into()))),
-            Err(TrainError::Unsuitable(_))
-        ));
+        let failed = alone.agree(Some(TrainError::Unsuitable("x".into())));
+        assert!(matches!(failed, Err(TrainError::Unsuitable(_))));
         let mut values = [1.0, f32::NAN];
         alone.sum(&mut values);
         assert!(values[0] == 1.0 && values[1].is_nan());
@@ -255,12 +235,8 @@ mod tests {
     #[test]
     fn shares_are_even_and_whole() {
         for (count, size) in [(4, 4), (5, 4), (3, 4), (0, 2), (17, 5)] {
-            let shares: Vec<_> =
-                (0..size).map(|rank| Ranks { rank, size, ..Ranks::default() }.share(count)).collect();
-            assert_eq!(
-                shares.iter().flat_map(Clone::clone).collect::<Vec<_>>(),
-                (0..count).collect::<Vec<_>>()
-            );
+            let shares: Vec<_> = (0..size).map(|rank| share([rank, size], count)).collect();
+            assert!(shares.iter().cloned().flatten().eq(0..count), "{shares:?}");
             let lengths = || shares.iter().map(ExactSizeIterator::len);
             assert!(lengths().max() <= lengths().min().map(|least| least + 1), "{shares:?}");
         }

@@ -143,16 +143,12 @@ pub fn rehearse<T: Task>(
     let mut learner = Learner::new(task, config, networks, device, ranks);
     learner.compare(&Identity::of(task, config)?)?;
     let mut start = Instant::now();
-    let mut made = 0;
-    while made < STEPS[0] + STEPS[1] {
+    for made in 0..STEPS[0] + STEPS[1] {
         if made == STEPS[0] {
             start = Instant::now();
         }
-        match learner.step()? {
-            Ok(_) => made += 1,
-            Err(skipped) => {
-                return Err(TrainError::Unsuitable(format!("no step can be made: {skipped}")));
-            }
+        if let Err(skipped) = learner.step()? {
+            return Err(TrainError::Unsuitable(format!("no step can be made: {skipped}")));
         }
     }
     let step = start.elapsed() / STEPS[1];
@@ -305,7 +301,7 @@ impl<'a, T: Task> Session<'a, T> {
     /// Turns the error of a sample into a note. The validation or preview is lost, but the run continues.
     fn spared(&mut self, what: &str, shown: Result<(), TrainError>) -> Result<(), TrainError> {
         match shown {
-            Err(e @ (TrainError::Unsuitable(_) | TrainError::Splat(_) | TrainError::Elsewhere { .. })) => {
+            Err(e @ (TrainError::Unsuitable(_) | TrainError::Splat(_) | TrainError::Elsewhere(_))) => {
                 let step = self.learner.progress.step;
                 self.watch.note(&format!("no {what} after step {step}: {e}"));
                 Ok(())
@@ -335,7 +331,9 @@ impl<'a, T: Task> Session<'a, T> {
         let Some(validation) = validation else { return Ok(()) };
         let beats = |best: u64| validation.score < f64::from_bits(best);
         if validation.score.is_finite() && self.learner.progress.best.is_none_or(|(_, best)| beats(best)) {
-            self.write(&networks, BEST)?;
+            if self.log.is_some() {
+                write_weights(&self.learner, &networks, &self.options.folder.join(BEST))?;
+            }
             self.learner.progress.best = Some((step, validation.score.to_bits()));
         }
         let named = validation.figures.iter().map(|(name, value)| (format!("validation/{name}"), *value));
@@ -345,13 +343,6 @@ impl<'a, T: Task> Session<'a, T> {
         self.add(Line { step, seconds: self.seconds(), values })?;
         self.watch.validated(step, &validation);
         Ok(())
-    }
-
-    fn write(&self, networks: &Networks, name: &str) -> Result<(), TrainError> {
-        if self.log.is_none() {
-            return Ok(());
-        }
-        write_weights(&self.learner, networks, &self.options.folder.join(name))
     }
 
     fn preview(&mut self) -> Result<(), TrainError> {
@@ -368,7 +359,7 @@ impl<'a, T: Task> Session<'a, T> {
     fn save(&mut self) -> Result<(), TrainError> {
         self.learner.compare(&self.identity)?;
         let Some(log) = &self.log else { return Ok(()) };
-        self.write(&self.learner.averaged(), LAST)?;
+        write_weights(&self.learner, &self.learner.averaged(), &self.options.folder.join(LAST))?;
         save_state(&self.options.folder.join(STATE), &self.learner, &self.identity)?;
         let (path, svg) = (self.options.folder.join(CURVES), log.curves());
         Ok(file::write_whole(&path, |out| out.write_all(svg.as_bytes())).map_err(FileError::write(&path))?)
@@ -391,11 +382,5 @@ fn save_state<T: Task>(path: &Path, learner: &Learner<T>, identity: &Identity) -
 /// Runs `work` on the best thread for its device. For the CPU it is a thread of rayon's pool, since any other thread
 /// passes every operator to the pool and waits. Other devices order their work by the calling thread.
 pub fn on_best_thread<R: Send>(device: &Device, work: impl FnOnce() -> R + Send) -> R {
-    if device.clone().inner() == Device::flex() {
-        let mut result = None;
-        rayon::scope(|_| result = Some(work()));
-        result.expect("the scope runs it")
-    } else {
-        work()
-    }
+    if device.clone().inner() == Device::flex() { rayon::scope(|_| work()) } else { work() }
 }

@@ -123,14 +123,12 @@ mod tests {
     fn trapezoid_is_constant_until_it_falls() {
         let schedule = Schedule::Trapezoid { warm_up: 9, fall: 100 };
         let share = |step| schedule.share(step, 1000);
-        assert!((share(0) - 0.1).abs() < 1e-12 && (share(8) - 0.9).abs() < 1e-12);
         assert!((9..900).all(|step| share(step) == 1.0), "constant");
         // 100 steps from the highest rate to the last.
-        assert!(
-            (share(949) - 0.505).abs() < 1e-12
-                && (share(999) - 0.01).abs() < 1e-12
-                && share(2000) == share(999)
-        );
+        for (step, expected) in [(0, 0.1), (8, 0.9), (949, 0.505), (999, 0.01)] {
+            assert!((share(step) - expected).abs() < 1e-12, "{step}: {}", share(step));
+        }
+        assert_eq!(share(2000), share(999));
         assert_eq!(schedule.share(500, 100_000), share(500), "whatever the number of steps");
         assert_eq!(schedule.problem(1000), None);
         assert_eq!(schedule.problem(108).map(|(key, _)| key), Some("fall"));

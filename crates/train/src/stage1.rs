@@ -3,13 +3,12 @@
 
 use std::sync::Arc;
 
-use burn::data::dataloader::batcher::Batcher;
 use burn::tensor::Device;
 use glam::Vec3;
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 use snapsnap_data::dataset::Folder;
-use snapsnap_data::sample::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
+use snapsnap_data::sample::{Stage1, Stage1Batch, Stage1Item};
 use snapsnap_net::config::Config;
 use snapsnap_net::network::{PointMap, View};
 use snapsnap_net::steps::Record;
@@ -67,7 +66,7 @@ impl PointTask {
 
     /// Predicted maps of a sample on the whole canvas.
     fn maps(&self, networks: &Networks, item: &Stage1Item) -> Vec<Map> {
-        let batch = Stage1Batcher.batch(vec![item.clone()], &self.device.clone().inner());
+        let batch = Stage1Batch::new(vec![item.clone()], &self.device.clone().inner());
         let prediction = self.predict(networks, &batch, Window::around_person(&item.masks, item.side));
         let maps = prediction.pasted(&self.networks.network);
         let read = |(view, map): (View, PointMap)| (view as usize, host(map.points), host(map.conf));
@@ -98,7 +97,7 @@ impl Task for PointTask {
         items: Vec<Stage1Item>,
         at: Moment,
     ) -> Result<Vec<Part>, TrainError> {
-        let batch = Stage1Batcher.batch(items, &self.device);
+        let batch = Stage1Batch::new(items, &self.device);
         let prediction = self.predict(networks, &batch, at.extent);
         let relief = self.losses.relief_weight > 0.0;
         Ok(losses(&prediction, &batch.points, &batch.valid, relief).parts(&self.losses))
@@ -137,10 +136,10 @@ impl Task for PointTask {
                 let shown = |there: bool, p: Vec3| if there { place_color(p) } else { [0.0; 3] };
                 let error = |i: usize| if there(i) { at(&points, i).distance(truth(i)) } else { 0.0 };
                 row.extend([
-                    picture(side, photo),
-                    picture(side, |i| shown(seen(i), at(&points, i))),
-                    picture(side, |i| shown(there(i), truth(i))),
-                    picture(side, |i| heat(error(i), WORST)),
+                    picture([side; 2], photo),
+                    picture([side; 2], |i| shown(seen(i), at(&points, i))),
+                    picture([side; 2], |i| shown(there(i), truth(i))),
+                    picture([side; 2], |i| heat(error(i), WORST)),
                 ]);
             }
         }

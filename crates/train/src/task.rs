@@ -53,11 +53,6 @@ pub trait Task: Sync {
     /// Samples of the training and of its validations.
     fn data(&self) -> &Data<Self::Item>;
 
-    /// Number of samples of a validation.
-    fn validation_samples(&self) -> usize {
-        self.data().count
-    }
-
     /// Name of a sample: its data set, subject and view.
     fn name(item: &Self::Item) -> &str;
 

@@ -1,7 +1,9 @@
 //! Evaluations.
 
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::fs;
+use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 
 use serde_json::Value;
@@ -410,6 +412,9 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     // `..` after a folder that does not exist.
     let said = refused(&mut evaluate(people(), &people().join("no/../report"), &[]));
     assert!(said.contains("lies in a data set") && !people().join("no").exists(), "{said}");
+    // The report's config contains the path.
+    let said = refused(&mut evaluate(Path::new(OsStr::from_bytes(b"in\xff")), &report, &[]));
+    assert!(said.contains("not UTF-8") && !report.exists(), "{said}");
     // A folder with other files is refused.
     let training = temporary.path().join("training");
     fs::create_dir(&training).expect("a folder");

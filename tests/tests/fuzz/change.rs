@@ -8,27 +8,12 @@ use proptest::sample::{Index, select};
 
 /// Where readers decide what follows: half of all changes are there.
 const HEAD: usize = 256;
-/// Most bytes that are moved, repeated or removed.
+/// Most bytes of a block that is moved, repeated or removed.
 const BLOCK: usize = 64;
-/// Whole numbers at which sums, shifts, signs and allocations go wrong. The last two are both sides of a large picture.
-const WHOLE: [u64; 16] = [
-    0,
-    1,
-    2,
-    0x7f,
-    0x80,
-    0xff,
-    0x7fff,
-    0xffff,
-    1 << 31,
-    (1 << 31) - 1,
-    (1 << 32) - 1,
-    u64::MAX,
-    u64::MAX / 2,
-    1_000_000_000,
-    0x3e80_3e7f,
-    0x3e80_0000_3e7f,
-];
+/// More bytes than any file has.
+const ALL: usize = usize::MAX;
+/// Large numbers that are no powers of two. The last two are both sides of a large picture.
+const LARGE: [u64; 3] = [1_000_000_000, 0x3e80_3e7f, 0x3e80_0000_3e7f];
 /// Numbers at which arithmetic goes wrong.
 const REAL: [f64; 8] =
     [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e38, -1e38, 1e-45, f64::MAX, f64::MIN_POSITIVE];
@@ -36,45 +21,29 @@ const REAL: [f64; 8] =
 const WORDS: &str = "0 -0 1 -1 2 0.5 nan inf -inf 1e38 1e39 1e999 1e-45 255 256 65536 2147483648 -2147483648 4294967295 \
                      9223372036854775807 18446744073709551615 99999999999999999999 null true [] \u{1b}[31m \
                      \u{1b}]0;title\u{7} \u{9b}31m\r\0 \u{202e}\u{7f} ";
-/// Brackets nested deeper than any stack that a parser could recurse on, and words without an end.
-const ENDLESS: [(&str, usize); 8] = [
-    ("[", 200_000),
-    ("{\"a\":", 200_000),
-    ("(", 200_000),
-    ("a.", 200_000),
-    ("x", 3_000_000),
-    ("1", 3_000_000),
-    (" ", 3_000_000),
-    ("\"", 3_000_000),
-];
+/// Brackets nested deeper than any stack that a parser could recurse on, and words without an end, when repeated.
+const ENDLESS: [&str; 8] = ["[", "{\"a\":", "(", "a.", "x", "1", " ", "\""];
 /// How often an item is repeated: small files that unfold to large ones.
 const MANY: usize = 20_000;
-/// Most bytes that repetition adds.
-const REPEATED: usize = 4 << 20;
+/// Most bytes that repetition adds. The program reads configs of a little more.
+const REPEATED: usize = 1_000_000;
 
-/// A place between bytes.
-#[derive(Debug, Clone, Copy)]
-pub struct Place {
-    in_head: bool,
-    at: Index,
-}
+/// A place between bytes: whether it is in the head, and where.
+type Place = (bool, Index);
 
-impl Place {
-    fn of(self, bytes: &[u8]) -> usize {
-        self.at.index(1 + if self.in_head { bytes.len().min(HEAD) } else { bytes.len() })
-    }
+fn place((is_in_head, at): Place, bytes: &[u8]) -> usize {
+    at.index(1 + if is_in_head { bytes.len().min(HEAD) } else { bytes.len() })
 }
 
 /// A change of bytes, whatever they mean.
 #[derive(Debug, Clone)]
 enum Binary {
-    Cut(Place),
     Overwrite {
         at: Place,
         aligned: bool,
         value: Vec<u8>,
     },
-    /// A block of this or another file takes the place of so many bytes.
+    /// A block of this or another file takes the place of so many bytes; [`ALL`] goes to the end.
     Copy {
         from: Place,
         length: usize,
@@ -82,20 +51,17 @@ enum Binary {
         removed: usize,
         is_other: bool,
     },
-    /// The beginning of this file and the end of another.
-    Join(Place, Place),
 }
 
 /// A change of text, which changes of bytes would hardly ever make.
 #[derive(Debug, Clone)]
 enum Text {
-    Word(Index, &'static str),
+    /// A word takes the place of another, or goes into the middle of it, so many times.
+    Word(Index, bool, (&'static str, usize)),
     OtherWord(Index, Index),
-    Within(Index, &'static str),
-    Endless(Index, (&'static str, usize)),
     /// A line, before another, so many times; 0 removes it.
     Line(Index, Index, usize),
-    /// The item of a list, many times.
+    /// The item of a list, or a text without lists, many times.
     Items(Index),
 }
 
@@ -113,49 +79,45 @@ pub fn changes() -> impl Strategy<Value = Vec<Change>> {
     prop_oneof![3 => vec(change.clone(), 1), 2 => vec(change, 2..=4)]
 }
 
-fn place() -> impl Strategy<Value = Place> + Clone {
-    any::<(bool, Index)>().prop_map(|(in_head, at)| Place { in_head, at })
-}
-
 fn binary() -> impl Strategy<Value = Binary> + Clone {
-    let whole = (select(&WHOLE[..]), select(&[1_usize, 2, 4, 8][..]))
+    // Powers of two and their neighbours, at which sums, shifts, signs and allocations go wrong.
+    let power = (0..64_u32, 0..3_u64).prop_map(|(bits, more)| (u64::MAX >> bits).wrapping_add(more));
+    let whole = (prop_oneof![3 => power, 1 => select(&LARGE[..])], select(&[1_usize, 2, 4, 8][..]))
         .prop_map(|(value, size)| value.to_le_bytes()[..size].to_vec());
     let real = (select(&REAL[..]), any::<bool>()).prop_map(|(value, single)| {
         if single { (value as f32).to_le_bytes().to_vec() } else { value.to_le_bytes().to_vec() }
     });
-    let number =
-        (prop_oneof![2 => whole, 1 => real], any::<bool>()).prop_map(|(mut bytes, is_big_endian)| {
-            if is_big_endian {
-                bytes.reverse();
-            }
-            bytes
-        });
     let value = prop_oneof![
-        4 => number,
+        3 => whole,
+        1 => real,
         2 => vec(any::<u8>(), 1..=8),
         1 => (1..=BLOCK).prop_map(|length| vec![0; length]),
     ];
-    let overwrite = (place(), any::<bool>(), value);
-    let copy = (place(), 0..=BLOCK, place(), 0..=BLOCK, any::<bool>());
+    let value = (value, any::<bool>()).prop_map(|(bytes, is_big_endian): (Vec<u8>, bool)| {
+        if is_big_endian { bytes.into_iter().rev().collect() } else { bytes }
+    });
+    let overwrite = (any::<Place>(), any::<bool>(), value);
+    // Nothing and everything: a file is cut, joined to another, or has a block more or less.
+    let length = || prop_oneof![2 => 0..=BLOCK, 1 => Just(0), 1 => Just(ALL)];
+    let copy = (any::<Place>(), length(), any::<Place>(), length(), any::<bool>());
     prop_oneof![
-        1 => place().prop_map(Binary::Cut),
-        7 => overwrite.prop_map(|(at, aligned, value)| Binary::Overwrite { at, aligned, value }),
-        4 => copy.prop_map(|(from, length, to, removed, is_other)| {
+        1 => overwrite.prop_map(|(at, aligned, value)| Binary::Overwrite { at, aligned, value }),
+        1 => copy.prop_map(|(from, length, to, removed, is_other)| {
             Binary::Copy { from, length, to, removed, is_other }
         }),
-        1 => (place(), place()).prop_map(|(at, from)| Binary::Join(at, from)),
     ]
 }
 
 fn text() -> impl Strategy<Value = Text> + Clone {
     let index = any::<Index>;
-    let word = || select(WORDS.split(' ').collect::<Vec<_>>());
+    let known = select(WORDS.split(' ').collect::<Vec<_>>()).prop_map(|word| (word, 1_usize));
+    let endless = select(&ENDLESS[..]).prop_map(|word| (word, REPEATED));
+    let new = prop_oneof![8 => known, 1 => endless];
     let times = prop_oneof![2 => Just(0), 3 => Just(1), 1 => Just(MANY)];
     prop_oneof![
-        6 => (index(), word()).prop_map(|(word, new)| Text::Word(word, new)),
+        9 => (index(), prop::bool::weighted(0.25), new)
+            .prop_map(|(at, is_within, new)| Text::Word(at, is_within, new)),
         4 => (index(), index()).prop_map(|(word, other)| Text::OtherWord(word, other)),
-        2 => (index(), word()).prop_map(|(word, new)| Text::Within(word, new)),
-        1 => (index(), select(&ENDLESS[..])).prop_map(|(word, what)| Text::Endless(word, what)),
         3 => (index(), index(), times).prop_map(|(line, to, times)| Text::Line(line, to, times)),
         1 => index().prop_map(Text::Items),
     ]
@@ -181,23 +143,18 @@ impl Change {
 impl Binary {
     fn apply(&self, bytes: &mut Vec<u8>, other: &[u8]) {
         match self {
-            Self::Cut(at) => bytes.truncate(at.of(bytes)),
             Self::Overwrite { at, aligned, value } => {
-                let at = at.of(bytes);
+                let at = place(*at, bytes);
                 let at = if *aligned { at - at % value.len() } else { at };
                 let end = (at + value.len()).min(bytes.len());
                 bytes[at..end].copy_from_slice(&value[..end - at]);
             }
             Self::Copy { from, length, to, removed, is_other } => {
                 let source: &[u8] = if *is_other { other } else { bytes };
-                let from = from.of(source);
-                let copy = source[from..(from + length).min(source.len())].to_vec();
-                let to = to.of(bytes);
-                bytes.splice(to..(to + removed).min(bytes.len()), copy);
-            }
-            Self::Join(at, from) => {
-                bytes.truncate(at.of(bytes));
-                bytes.extend_from_slice(&other[from.of(other)..]);
+                let from = place(*from, source);
+                let copy = source[from..from.saturating_add(*length).min(source.len())].to_vec();
+                let to = place(*to, bytes);
+                bytes.splice(to..to.saturating_add(*removed).min(bytes.len()), copy);
             }
         }
     }
@@ -211,21 +168,15 @@ impl Text {
             if runs.is_empty() { 0..0 } else { runs[index.index(runs.len())].clone() }
         };
         match self {
-            Self::Word(word, new) => {
-                bytes.splice(pick(word, &words), new.bytes());
+            Self::Word(at, is_within, (new, times)) => {
+                let Range { start, end } = pick(at, &words);
+                let middle = start.midpoint(end);
+                let place = if *is_within { middle..middle } else { start..end };
+                bytes.splice(place, repeated(new.as_bytes(), *times));
             }
             Self::OtherWord(word, other) => {
                 let other = bytes[pick(other, &words)].to_vec();
                 bytes.splice(pick(word, &words), other);
-            }
-            Self::Within(word, new) => {
-                let word = pick(word, &words);
-                let middle = word.start + word.len() / 2;
-                bytes.splice(middle..middle, new.bytes());
-            }
-            Self::Endless(word, (what, times)) => {
-                let start = pick(word, &words).start;
-                bytes.splice(start..start, what.repeat(*times).into_bytes());
             }
             Self::Line(line, to, times) => {
                 let (line, to) = (pick(line, &lines), pick(to, &lines).start);
@@ -238,12 +189,8 @@ impl Text {
                 }
             }
             Self::Items(list) => {
-                let lists: Vec<usize> = (0..bytes.len()).filter(|at| bytes[*at] == b'[').collect();
-                if lists.is_empty() {
-                    return;
-                }
-                let start = lists[list.index(lists.len())] + 1;
-                let item = [&bytes[start..value_end(bytes, start)], b","].concat();
+                let start = pick(list, &runs(bytes, |b| b == b'[')).end;
+                let item = [first_value(&bytes[start..]), b","].concat();
                 bytes.splice(start..start, repeated(&item, MANY));
             }
         }
@@ -265,16 +212,16 @@ fn repeated(part: &[u8], times: usize) -> Vec<u8> {
     part.repeat(times.min(1 + REPEATED / part.len().max(1)))
 }
 
-/// The end of the value that begins at `start`: the comma or bracket that closes it.
-fn value_end(bytes: &[u8], start: usize) -> usize {
-    let mut depth = 0_usize;
-    for (at, byte) in bytes.iter().enumerate().skip(start) {
+/// The bytes before the comma or bracket that closes the first value.
+fn first_value(bytes: &[u8]) -> &[u8] {
+    let mut depth = 0;
+    let end = bytes.iter().position(|byte| {
         match byte {
             b'[' | b'{' => depth += 1,
-            b',' | b']' | b'}' if depth == 0 => return at,
             b']' | b'}' => depth -= 1,
             _ => {}
         }
-    }
-    bytes.len()
+        depth < 0 || depth == 0 && *byte == b','
+    });
+    &bytes[..end.unwrap_or(bytes.len())]
 }

@@ -1,5 +1,6 @@
 //! What must hold of the outputs of commands that succeed.
 
+use std::error::Error;
 use std::fs;
 use std::path::Path;
 
@@ -10,84 +11,73 @@ use snapsnap_data::dataset;
 use snapsnap_mesh::import;
 use snapsnap_net::config::Config;
 use snapsnap_net::weights::{Source, WeightFile};
-use snapsnap_splat::scene;
+use snapsnap_splat::{camera_file, scene};
 
-/// Whether `reconstruct` wrote a PLY that can be read again, and its config.
-pub fn person(folder: &Path) -> Result<(), String> {
-    scene(folder)?;
-    Config::from_file(&folder.join("out.ply.config.toml"), &[]).map(drop).map_err(|e| e.to_string())
+/// Reads what a command wrote into a folder.
+///
+/// # Errors
+/// If it is not whole.
+pub fn check(command: &str, folder: &Path) -> Result<(), Box<dyn Error>> {
+    let [ply, weights] = ["out.ply", "out.safetensors"].map(|name| folder.join(name));
+    match command.split_whitespace().next() {
+        Some("reconstruct") => {
+            gaussians(&ply)?;
+            Config::from_file(&folder.join("out.ply.config.toml"), &[])?;
+        }
+        Some("convert") => gaussians(&ply)?,
+        Some("mesh") => import::read(&ply)?.check()?,
+        Some("render") => pictures(&folder.join("out"))?,
+        Some("export-weights") => drop(SafeTensors::deserialize(&fs::read(weights)?)?),
+        Some("import-weights") => finite(&weights)?,
+        Some("prepare") if !command.contains("prepare check") => data_set(&folder.join("out"))?,
+        Some("evaluate") if command.contains("--mesh-dir") => report(folder, "geometry_cm")?,
+        Some("evaluate") => report(folder, "protocols")?,
+        Some("bench") => report(folder, "settings")?,
+        _ => {}
+    }
+    Ok(())
 }
 
 /// Whether there are Gaussians.
-pub fn scene(folder: &Path) -> Result<(), String> {
-    let loaded = scene::read(&folder.join("out.ply"), &Device::flex()).map_err(|e| e.to_string())?;
+fn gaussians(path: &Path) -> Result<(), Box<dyn Error>> {
+    let loaded = scene::read(path, &Device::flex())?;
     if loaded.gaussians.is_empty() { Err("no Gaussian".into()) } else { Ok(()) }
 }
 
-pub fn mesh(folder: &Path) -> Result<(), String> {
-    let mesh = import::read(&folder.join("out.ply")).map_err(|e| e.to_string())?;
-    mesh.check().map_err(|e| e.to_string())
-}
-
-/// Whether `render` wrote pictures of the sizes of its own two cameras.
-pub fn rendered(folder: &Path) -> Result<(), String> {
-    pictures_of(folder, &folder.join("out/cameras.json"))
-}
-
-/// Whether `render` wrote pictures of the sizes of the given cameras, whatever the folder of inputs is called.
-pub fn rendered_by_cameras(folder: &Path) -> Result<(), String> {
-    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
-    let given = entries.map(|entry| entry.path().join("cameras.json")).find(|path| path.is_file());
-    pictures_of(folder, &given.unwrap_or_default())
-}
-
-fn pictures_of(folder: &Path, cameras: &Path) -> Result<(), String> {
-    let views = snapsnap_splat::camera_file::read(cameras).map_err(|e| e.to_string())?;
-    for (view, camera) in views.iter().enumerate() {
-        let picture = image::open(folder.join(format!("out/{view:03}.png")));
-        let picture = picture.map_err(|e| format!("picture {view}: {e}"))?;
+/// Whether the pictures have the sizes of their cameras.
+fn pictures(folder: &Path) -> Result<(), Box<dyn Error>> {
+    for (view, camera) in camera_file::read(&folder.join("cameras.json"))?.iter().enumerate() {
+        let picture = image::open(folder.join(format!("{view:03}.png")))?;
         if (picture.width(), picture.height()) != (camera.width, camera.height) {
-            return Err(format!("picture {view} has another size than its camera"));
+            return Err(format!("picture {view} has another size than its camera").into());
         }
     }
     Ok(())
-}
-
-pub fn tensors(folder: &Path) -> Result<(), String> {
-    let bytes = fs::read(folder.join("out.safetensors")).map_err(|e| e.to_string())?;
-    SafeTensors::deserialize(&bytes).map(drop).map_err(|e| e.to_string())
 }
 
 /// Whether the weight file fits its own config and all numbers are finite.
-pub fn weight_file(folder: &Path) -> Result<(), String> {
-    let path = folder.join("out.safetensors");
-    WeightFile::open(&path, None).map_err(|e| e.to_string())?;
-    let source = Source::open(&path).map_err(|e| e.to_string())?;
+fn finite(path: &Path) -> Result<(), Box<dyn Error>> {
+    WeightFile::open(path, None)?;
+    let source = Source::open(path)?;
     for name in source.tensors().keys() {
-        let values = source.read_f32(name).map_err(|e| e.to_string())?;
-        if values.iter().any(|value| !value.is_finite()) {
-            return Err(format!("`{name}` is not finite"));
+        if source.read_f32(name)?.iter().any(|value| !value.is_finite()) {
+            return Err(format!("`{name}` is not finite").into());
         }
     }
     Ok(())
 }
 
-/// Whether the data set in `out` has no fault, and a subject.
-pub fn data_set(folder: &Path) -> Result<(), String> {
-    let checked = dataset::check(&folder.join("out"), |_, _| ()).map_err(|e| e.to_string())?;
-    match checked.problems.first() {
-        Some(problem) => Err(problem.clone()),
-        None if checked.subjects == 0 => Err("no subject".into()),
-        None => Ok(()),
-    }
+/// Whether the data set has no fault; a set without people is one.
+fn data_set(folder: &Path) -> Result<(), Box<dyn Error>> {
+    let checked = dataset::check(folder, |_, _| ())?;
+    checked.problems.first().map_or(Ok(()), |problem| Err(problem.as_str().into()))
 }
 
-/// Whether there is a report of a command, with this key.
-pub fn report(folder: &Path, key: &str) -> Result<(), String> {
-    let text = fs::read_to_string(folder.join("out/report.json")).map_err(|e| format!("report.json: {e}"))?;
-    let report: serde_json::Value = serde_json::from_str(&text).map_err(|e| format!("report.json: {e}"))?;
-    match ["command", "left_out", key].iter().find(|key| report[**key].is_null()) {
-        Some(key) => Err(format!("report.json has no `{key}`")),
+/// Whether there is a report with this key.
+fn report(folder: &Path, key: &str) -> Result<(), Box<dyn Error>> {
+    let report: serde_json::Value = serde_json::from_slice(&fs::read(folder.join("out/report.json"))?)?;
+    match ["command", "left_out", key].into_iter().find(|key| report[*key].is_null()) {
+        Some(key) => Err(format!("report.json has no `{key}`").into()),
         None => Ok(()),
     }
 }

@@ -9,7 +9,7 @@ use flate2::write::GzEncoder;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-/// Name and content of each part.
+/// Name and content of each part. A chunk's type is in its content, and only entries of archives have names.
 pub type Parts = Vec<(Vec<u8>, Vec<u8>)>;
 
 const PNG: &[u8] = b"\x89PNG\r\n\x1a\n";
@@ -18,21 +18,14 @@ const PNG: &[u8] = b"\x89PNG\r\n\x1a\n";
 pub fn open(ending: &str, bytes: &[u8]) -> Option<Parts> {
     let mut parts = Parts::new();
     match ending {
-        "png" => {
-            let mut rest = bytes.strip_prefix(PNG)?;
+        "png" | "glb" => {
+            let is_png = ending == "png";
+            let mut rest = bytes.get(if is_png { PNG.len() } else { 12 }..)?;
             while let Some((length, more)) = rest.split_first_chunk() {
-                let (chunk, more) = more.split_at_checked(4 + u32::from_be_bytes(*length) as usize)?;
+                let length = if is_png { u32::from_be_bytes(*length) } else { u32::from_le_bytes(*length) };
+                let (chunk, more) = more.split_at_checked(4 + length as usize)?;
                 parts.push((Vec::new(), chunk.to_vec()));
-                rest = more.get(4..)?;
-            }
-        }
-        "glb" => {
-            let mut rest = bytes.get(12..)?;
-            while let Some((length, more)) = rest.split_first_chunk() {
-                let (kind, more) = more.split_at_checked(4)?;
-                let (chunk, more) = more.split_at_checked(u32::from_le_bytes(*length) as usize)?;
-                parts.push((kind.to_vec(), chunk.to_vec()));
-                rest = more;
+                rest = if is_png { more.get(4..)? } else { more };
             }
         }
         "spz" => {
@@ -43,7 +36,7 @@ pub fn open(ending: &str, bytes: &[u8]) -> Option<Parts> {
         "safetensors" => {
             let (length, rest) = bytes.split_first_chunk()?;
             let (header, data) = rest.split_at_checked(u64::from_le_bytes(*length) as usize)?;
-            parts.extend([(Vec::new(), header.to_vec()), (Vec::new(), data.to_vec())]);
+            parts.extend([header, data].map(|part| (Vec::new(), part.to_vec())));
         }
         "npz" | "pth" => {
             let mut archive = ZipArchive::new(Cursor::new(bytes)).ok()?;
@@ -69,15 +62,14 @@ pub fn close(ending: &str, parts: &Parts) -> Vec<u8> {
             bytes
         }),
         "glb" => {
-            let mut chunks = Vec::new();
-            for (kind, part) in parts {
-                let length = part.len().next_multiple_of(4);
-                chunks.extend((length as u32).to_le_bytes());
-                chunks.extend(kind);
-                chunks.extend(part);
-                let padding = if kind == b"JSON" { b' ' } else { 0 };
-                chunks.resize(chunks.len() + length - part.len(), padding);
-            }
+            let chunks = parts.iter().fold(Vec::<u8>::new(), |mut bytes, (_, chunk)| {
+                let length = chunk.len().saturating_sub(4).next_multiple_of(4);
+                let end = bytes.len() + 8 + length;
+                bytes.extend((length as u32).to_le_bytes());
+                bytes.extend(chunk);
+                bytes.resize(end, if chunk.starts_with(b"JSON") { b' ' } else { 0 });
+                bytes
+            });
             let length = (12 + chunks.len() as u32).to_le_bytes();
             [b"glTF", &2_u32.to_le_bytes()[..], &length, &chunks].concat()
         }

@@ -1,7 +1,7 @@
 //! Damaged files of every format that the program reads. Each must be read whole or refused, in bounded time and memory.
 //!
-//! A case is a sound sample of a [`Format`] with random changes, and the command that a user would run on it, in a process
-//! of its own. `SNAPSNAP_FUZZ_ONLY`, `_MINUTES` and `_FROM` are the options of `cargo xtask fuzz`.
+//! A case is a sound sample of a [`formats::Format`] with random changes, and the command that a user would run on it, in
+//! a process of its own. `SNAPSNAP_FUZZ_ONLY`, `_MINUTES` and `_FROM` are the options of `cargo xtask fuzz`.
 #![cfg(target_os = "linux")]
 
 mod case;
@@ -13,13 +13,12 @@ mod run;
 mod samples;
 
 use std::env;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, OnceLock};
+use std::fs;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
-use formats::Format;
 use proptest::test_runner::{Config, RngAlgorithm, TestCaseError, TestError, TestRng, TestRunner};
-use tempfile::TempDir;
+use rayon::prelude::*;
 
 use case::Sample;
 
@@ -31,74 +30,54 @@ fn damaged_files_are_read_whole_or_refused() {
     let variable = |name: &str| env::var(format!("SNAPSNAP_FUZZ_{name}")).ok();
     let only = variable("ONLY").unwrap_or_default();
     let first: u64 = variable("FROM").map_or(0, |seed| seed.parse().expect("a seed"));
-    let minutes = variable("MINUTES").map(|minutes| minutes.parse::<f64>().expect("a number of minutes"));
-    let end = minutes.map(|minutes| Instant::now() + Duration::from_secs_f64(60.0 * minutes));
-    let formats: Vec<(Format, OnceLock<Sample>)> = formats::all()
-        .into_iter()
-        .filter(|format| format.name.starts_with(&only))
-        .map(|format| (format, OnceLock::new()))
-        .collect();
+    let minutes: f64 = variable("MINUTES").map_or(0.0, |minutes| minutes.parse().expect("minutes"));
+    let end = Instant::now() + Duration::from_secs_f64(60.0 * minutes);
+    let mut formats = formats::all();
+    formats.retain(|format| format.name.starts_with(&only));
     assert!(!formats.is_empty(), "no format's name begins with `{only}`");
 
     let root = tempfile::Builder::new().prefix("snapsnap-fuzz-").tempdir().expect("a temporary folder");
-    let (next, cases) = (AtomicUsize::new(0), AtomicUsize::new(0));
-    let failures = Mutex::new(Vec::new());
-    let work = || {
-        loop {
-            let job = next.fetch_add(1, Ordering::Relaxed);
-            let (round, (format, sample)) = (job / formats.len(), &formats[job % formats.len()]);
-            if round > 0 && end.is_none_or(|end| Instant::now() > end) {
-                break;
-            }
-            let sample = sample.get_or_init(|| Sample::make(format, &root.path().join(format.name)));
-            if let Err(failure) = several(format, sample, first + round as u64, &root, &cases) {
-                println!("{failure}");
-                failures.lock().expect("no panic elsewhere").push(failure);
-            }
+    let samples = formats.into_par_iter().with_max_len(1);
+    let samples: Vec<Sample> = samples.map(|format| Sample::new(format, root.path())).collect();
+    let mut failures = Vec::new();
+    for seed in first.. {
+        let samples = samples.par_iter().with_max_len(1);
+        failures.par_extend(samples.filter_map(|sample| failure(sample, seed, root.path())));
+        if Instant::now() > end {
+            break;
         }
-    };
-    let cores = std::thread::available_parallelism().map_or(2, usize::from);
-    std::thread::scope(|scope| (0..cores).for_each(|_| drop(scope.spawn(work))));
-    let failures = failures.into_inner().expect("no panic elsewhere");
-    println!("{} cases, {} failures", cases.into_inner(), failures.len());
+    }
     assert!(failures.is_empty(), "{} failures:\n{}", failures.len(), failures.join("\n"));
 }
 
-/// Runs as many cases as the format's share is. A failing case is made smaller and its files are kept.
-fn several(
-    format: &Format,
-    sample: &Sample,
-    seed: u64,
-    root: &TempDir,
-    cases: &AtomicUsize,
-) -> Result<(), String> {
+/// Runs the format's cases of a seed. A failing case is made smaller, its files are kept, and it is described.
+fn failure(sample: &Sample, seed: u64, root: &Path) -> Option<String> {
+    let name = sample.format.name;
     let config = Config {
-        cases: format.share,
+        cases: sample.format.cases,
         failure_persistence: None,
         max_shrink_time: SHRINKING,
         max_shrink_iters: 200,
         ..Config::default()
     };
-    let mut bytes = [0; 32];
-    bytes[..8].copy_from_slice(&seed.to_le_bytes());
-    let name = &format.name.as_bytes()[..format.name.len().min(24)];
-    bytes[8..8 + name.len()].copy_from_slice(name);
+    let mut bytes = format!("{seed} {name}").into_bytes();
+    bytes.resize(32, 0);
     let random = TestRng::from_seed(RngAlgorithm::ChaCha, &bytes);
     let result = TestRunner::new_with_rng(config, random).run(&case::cases(), |case| {
-        cases.fetch_add(1, Ordering::Relaxed);
         let place = tempfile::tempdir_in(root).expect("a temporary folder");
-        let problems = sample.run(format, Some(&case), place.path()).problems;
+        let problems = sample.run(Some(&case), place.path()).problems;
         if problems.is_empty() { Ok(()) } else { Err(TestCaseError::fail(problems.join("; "))) }
     });
     let Err(TestError::Fail(reason, case)) = result else {
-        return result.map_err(|e| e.to_string());
+        return result.err().map(|e| e.to_string());
     };
-    let place =
-        std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("fuzz-{}-{seed}", format.name));
+    let place = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("fuzz-{name}-{seed}"));
     // Of a run before.
-    let _ = std::fs::remove_dir_all(&place);
-    sample.run(format, Some(&case), &place);
-    let command = format!("cargo xtask fuzz --only {} --from {seed}", format.name);
-    let file = sample.target(format, &case).display();
-    Err(format!("{}: {reason}\n  {command}\n  {file}: {case:?}\n  files: {}", format.name, place.display()))
+    let _ = fs::remove_dir_all(&place);
+    sample.run(Some(&case), &place);
+    let command = format!("cargo xtask fuzz --only {name} --from {seed}");
+    let (file, place) = (sample.target(&case).display(), place.display());
+    let failure = format!("{name}: {reason}\n  {command}\n  {file}: {case:?}\n  files: {place}");
+    println!("{failure}");
+    Some(failure)
 }

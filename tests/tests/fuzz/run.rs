@@ -2,58 +2,31 @@
 //! may be shown, and nothing is left half done or touched that is not the program's.
 
 use std::collections::BTreeMap;
-use std::ffi::OsString;
+use std::ffi::OsStr;
 use std::fs;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use super::case::{INPUTS, ODD_INPUTS};
+use snapsnap_tests::{files, limited, snapsnap};
+
+use super::checks;
 use super::formats::Format;
 
 /// Longest that any input may keep the program busy.
 const LONGEST: Duration = Duration::from_secs(20);
-/// Address space in kilobytes: more would take the machine's memory.
-const ADDRESSES: u64 = 4_000_000;
+/// No core dumps, and an address space in kilobytes: more would take the machine's memory.
+const LIMITS: &str = "-c 0; ulimit -v 4000000";
 /// How often memory is looked at: less than it takes to fill a few tens of megabytes.
 const LOOK: Duration = Duration::from_millis(2);
-/// Length to which the system cuts the names of programs.
-const NAME: usize = 15;
 /// Names of files that are being written and not yet whole.
 const UNFINISHED: [&str; 2] = [".snapsnap-", ".unfinished"];
 /// Longest quotation in a problem.
 const QUOTED: usize = 200;
 
-/// Everything below a folder, by path: bytes of a file, `None` for anything else.
-pub type Tree = BTreeMap<PathBuf, Option<Vec<u8>>>;
-
-/// Reads a folder. Links are not followed.
-///
-/// # Panics
-/// If it cannot be read.
-pub fn read_tree(root: &Path) -> Tree {
-    let mut tree = Tree::new();
-    let mut folders = vec![root.to_owned()];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(&folder).expect("a folder") {
-            let path = entry.expect("an entry").path();
-            let kind = fs::symlink_metadata(&path).expect("an entry").file_type();
-            if kind.is_dir() {
-                folders.push(path.clone());
-            }
-            let content = kind.is_file().then(|| fs::read(&path).expect("a file"));
-            tree.insert(path.strip_prefix(root).expect("below").to_owned(), content);
-        }
-    }
-    tree
-}
-
-/// Most memory for an input that is so many bytes longer than the sound one: numbers and lists take more room in memory
-/// than in text.
-pub fn most_memory(sound: u64, longer: u64) -> u64 {
-    sound + (300 << 20) + 50 * longer
-}
+/// Files below a folder.
+type Files = BTreeMap<PathBuf, Vec<u8>>;
 
 /// How a run went.
 pub struct Run {
@@ -62,33 +35,35 @@ pub struct Run {
     /// Most memory that was resident at once, bytes.
     pub memory: u64,
     /// What it printed, on both streams.
-    pub printed: Vec<u8>,
+    pub printed: String,
     /// What must not be.
     pub problems: Vec<String>,
 }
 
-/// Runs the program in the folder `work`; `notes` is a folder for its output.
+/// Runs the format's command in the folder `work` of `place`. `inputs` is the name of the folder of inputs.
 ///
 /// # Panics
-/// If there is no shell, or no room in `notes`.
-pub fn run(format: &Format, arguments: &[OsString], work: &Path, notes: &Path, most_memory: u64) -> Run {
-    let before = read_tree(work);
-    let program = PathBuf::from(snapsnap_tests::snapsnap().get_program());
-    let streams = ["stdout", "stderr"].map(|name| notes.join(name));
-    let [out, err] = streams.each_ref().map(|path| fs::File::create(path).expect("a file of output"));
-    let limit = format!("ulimit -c 0; ulimit -v {ADDRESSES}; exec \"$@\"");
-    let mut command = Command::new("sh");
-    command.arg("-c").arg(limit).arg("sh").arg(&program).args(arguments).current_dir(work);
+/// If there is no shell, or no room in `place`.
+pub fn run(format: &Format, inputs: &OsStr, place: &Path, most_memory: u64) -> Run {
+    let work = place.join("work");
+    let before = files(&work);
+    let mut command = snapsnap();
+    command.current_dir(&work).args(format.command.split_whitespace().map(|word| {
+        let input = word.strip_prefix("in/").map(|name| Path::new(inputs).join(name));
+        input.unwrap_or_else(|| word.into())
+    }));
+    let printed = place.join("printed");
+    let out = fs::File::create(&printed).expect("a file of output");
+    let err = out.try_clone().expect("a second stream");
+    let mut command = limited(&command, LIMITS);
     // Every thread has a stack: as many on every machine, so that memory compares.
     command.env_remove("RUST_BACKTRACE").env("RAYON_NUM_THREADS", "2");
     command.stdin(Stdio::null()).stdout(out).stderr(err);
     let start = Instant::now();
     let mut child = command.spawn().expect("a shell");
-    let status = format!("/proc/{}/status", child.id());
-    let name = program.file_name().expect("a program's name").to_string_lossy();
     let mut memory = 0;
     let ended = loop {
-        memory = memory.max(high_water(&status, &name));
+        memory = memory.max(high_water(child.id()));
         if let Some(status) = child.try_wait().expect("the child can be waited for") {
             break Some(status);
         }
@@ -100,9 +75,9 @@ pub fn run(format: &Format, arguments: &[OsString], work: &Path, notes: &Path, m
         }
         std::thread::sleep(LOOK);
     };
-    let printed: Vec<u8> = streams.iter().flat_map(|path| fs::read(path).expect("output")).collect();
+    let printed = fs::read(printed).expect("output");
     let code = ended.and_then(|status| status.code());
-    let is_done = code == Some(0) || format.is_partial && code == Some(1);
+    let is_done = code == Some(0) || format.is_partial() && code == Some(1);
     let mut problems = Vec::new();
     match ended {
         None => problems.push(format!("no end within {} s", LONGEST.as_secs())),
@@ -116,27 +91,27 @@ pub fn run(format: &Format, arguments: &[OsString], work: &Path, notes: &Path, m
     if code != Some(0) && printed.trim_ascii().is_empty() {
         problems.push("fails without a word".into());
     }
-    problems.extend(about_files(format, is_done, &before, &read_tree(work)));
+    if work.join("out/.unfinished").exists() {
+        problems.push("left the folder of unfinished people".into());
+    }
+    problems.extend(about_files(format, inputs, is_done, &before, &files(&work)));
     if is_done {
-        match catch_unwind(AssertUnwindSafe(|| (format.is_whole)(work))) {
+        match catch_unwind(AssertUnwindSafe(|| checks::check(&format.command, &work))) {
             Ok(Ok(())) => {}
             Ok(Err(problem)) => problems.push(format!("what it wrote is not whole: {problem}")),
             Err(_) => problems.push("what it wrote makes its reader panic".into()),
         }
     }
-    Run { code, memory, printed, problems }
+    Run { code, memory, printed: String::from_utf8_lossy(&printed).into_owned(), problems }
 }
 
-/// Most memory that the process had resident so far; 0 before it runs this program (it shares this one's memory, then
-/// it is the shell) and after its end.
-fn high_water(status: &str, program: &str) -> u64 {
-    let text = fs::read_to_string(status).unwrap_or_default();
-    let value = |key: &str| text.lines().find_map(|line| line.strip_prefix(key)).map_or("", str::trim);
-    if value("Name:") != program.get(..NAME).unwrap_or(program) {
-        return 0;
-    }
-    let kilobytes = value("VmHWM:").strip_suffix(" kB").and_then(|number| number.parse::<u64>().ok());
-    1024 * kilobytes.unwrap_or(0)
+/// Most memory that the process had resident so far; 0 before it runs the program (it shares this one's memory, then it
+/// is the shell) and after its end.
+fn high_water(process: u32) -> u64 {
+    let status = fs::read_to_string(format!("/proc/{process}/status")).unwrap_or_default();
+    let mut lines = status.lines().filter(|_| status.starts_with("Name:\tsnapsnap"));
+    let kilobytes = lines.find_map(|line| line.strip_prefix("VmHWM:")?.trim().strip_suffix(" kB"));
+    kilobytes.map_or(0, |number| 1024 * number.parse::<u64>().expect("a number"))
 }
 
 fn about_words(printed: &[u8]) -> Vec<String> {
@@ -144,44 +119,29 @@ fn about_words(printed: &[u8]) -> Vec<String> {
     let Ok(text) = std::str::from_utf8(printed) else {
         return vec![format!("prints what is no UTF-8: {}", short(&String::from_utf8_lossy(printed)))];
     };
-    let mut problems = Vec::new();
-    let odd_name = String::from_utf8_lossy(ODD_INPUTS);
-    if text.contains(&*odd_name) {
-        problems.push("prints control characters: those of a folder's name".into());
-    }
-    let text = text.replace(&*odd_name, INPUTS);
-    if let Some(at) = text.find("panicked at") {
-        problems.push(format!("panicked: {}", short(&text[at..])));
-    }
+    let panicked = text.find("panicked at").map(|at| format!("panicked: {}", short(&text[at..])));
     let is_odd = |c: char| c.is_control() && c != '\n' && c != '\t';
-    if let Some(line) = text.lines().find(|line| line.contains(is_odd)) {
-        problems.push(format!("prints control characters: {}", short(line)));
-    }
-    problems
+    let odd = text.lines().find(|line| line.contains(is_odd));
+    let odd = odd.map(|line| format!("prints control characters: {}", short(line)));
+    panicked.into_iter().chain(odd).collect()
 }
 
-fn about_files(format: &Format, is_done: bool, before: &Tree, after: &Tree) -> Vec<String> {
-    // The folder of inputs may have another name that begins the same.
-    let is_input = |path: &Path| {
-        path.to_string_lossy().starts_with(&format!("{INPUTS}/"))
-            || path.to_string_lossy().starts_with(&format!("{INPUTS} "))
-    };
-    let name = |path: &Path| path.display().to_string().escape_debug().to_string();
+fn about_files(format: &Format, inputs: &OsStr, is_done: bool, before: &Files, after: &Files) -> Vec<String> {
     let mut problems = Vec::new();
     for (path, content) in before {
         // A success replaces its output.
-        if (is_input(path) || !is_done) && after.get(path) != Some(content) {
-            problems.push(format!("{} was there before, and is gone or changed", name(path)));
+        if (path.starts_with(inputs) || !is_done) && after.get(path) != Some(content) {
+            problems.push(format!("{path:?} was there before, and is gone or changed"));
         }
     }
-    for (path, content) in after.iter().filter(|(path, _)| !before.contains_key(*path)) {
-        let is_left = format.kept.iter().any(|kept| path.starts_with(kept));
+    for path in after.keys().filter(|path| !before.contains_key(*path)) {
+        let is_kept = format.kept.iter().any(|kept| path.starts_with(kept));
         if UNFINISHED.iter().any(|part| path.to_string_lossy().contains(part)) {
-            problems.push(format!("left {} unfinished", name(path)));
-        } else if is_input(path) {
-            problems.push(format!("wrote {} among its inputs", name(path)));
-        } else if !is_done && content.is_some() && !is_left {
-            problems.push(format!("wrote {} though it failed", name(path)));
+            problems.push(format!("left {path:?} unfinished"));
+        } else if path.starts_with(inputs) {
+            problems.push(format!("wrote {path:?} among its inputs"));
+        } else if !is_done && !is_kept {
+            problems.push(format!("wrote {path:?} though it failed"));
         }
     }
     problems

@@ -4,7 +4,6 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_base::config::Schema;
 use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
 use snapsnap_net::network::{Decoded, Input, PointMap, View, activate};
-use snapsnap_net::regressor::{RECEPTIVE_RADIUS, Statistics};
 use snapsnap_net::resample::shrink;
 use snapsnap_net::steps::Step;
 use snapsnap_net::weights::{WeightFile, init};
@@ -286,44 +285,6 @@ fn every_fusion_and_head_gives_points_of_its_own_on_oblong_pictures() {
         let net = weights.point_predictor(&device).expect("weights");
         assert_eq!(net.forward(pair(image(1), image(2)), &Window::whole(64)).len(), 2);
     }
-}
-
-#[test]
-fn cropping_changes_nothing_inside_the_mask_with_frozen_statistics() {
-    let Some(device) = device() else { return };
-    let config = config(&[]);
-    let (_file, weights) = weights(&config, 9);
-    let regressor = &weights.regressors(&device).expect("weights")[0];
-    let side = 384;
-    let mut mask = vec![false; side * side];
-    for y in 170..214 {
-        mask[y * side + 160..y * side + 190].fill(true);
-    }
-    let person = Window::around([mask.as_slice()].into_iter(), side).expect("pixels");
-    let image = noise(6 * side * side, 5);
-    let tensor =
-        |values: Vec<f32>, h, w| Tensor::<4>::from_data(TensorData::new(values, [1, 6, h, w]), &device);
-    let mut statistics = Statistics::measured();
-    let whole = values(regressor.forward(tensor(image.clone(), side, side), &mut statistics));
-    let inside = |features: &[f32], window: &Window| -> Vec<f32> {
-        let rows = window.indices(&mask, side);
-        rows.iter().flat_map(|&i| features[i as usize * 14..][..14].to_vec()).collect()
-    };
-    let cropped = |window: &Window| {
-        let crop = tensor(window.crop(&image, 6, side), window.rows.len(), window.columns.len());
-        inside(&values(regressor.forward(crop, &mut statistics.frozen())), window)
-    };
-    let expected = inside(&whole, &Window::whole(side));
-    let padded = person.padded(config.regressor.margin(), side);
-    assert!(padded.rows.len() < side && padded.columns.len() < side, "the window is a real crop");
-    let error = relative_error(&cropped(&padded), &expected);
-    println!("cropped with a margin of {RECEPTIVE_RADIUS} pixels: relative error {error:.2e}");
-    assert!(error < 1e-6, "{error:e}");
-    // Without the margin there is a difference, so the test can fail.
-    let tight = Window { rows: 168..216, columns: 160..192 };
-    let error = relative_error(&cropped(&tight), &expected);
-    println!("cropped without a margin: relative error {error:.2e}");
-    assert!(error > 1e-4, "{error:e}");
 }
 
 #[test]

@@ -107,7 +107,7 @@ fn the_oracle_agrees_with_the_fixtures() {
         let mut gradient: Option<Scene<f64>> = None;
         for (i, camera) in cameras.iter().enumerate() {
             let pixels = reference::render(&scene, camera, &options, Cutoff::Hard);
-            let worst = worst(&numbers, i, pixels.iter().map(|p| p.channels()), &vec![false; pixels.len()]);
+            let worst = worst(&numbers, i, pixels.iter().copied(), &vec![false; pixels.len()]);
             println!("{name}, camera {i}: pixels {worst:.1e}");
             // The constants ε, α_max and 1/255 are f32 here, f64 in the fixtures.
             assert!(worst < 1e-7, "{name}: {worst:e}");
@@ -148,8 +148,7 @@ fn the_operation_agrees_with_the_fixtures_better_than_plain_f32() {
             let banded: Vec<bool> = numbers.u8(&format!("banded.{i}")).1.iter().map(|b| *b != 0).collect();
             let scene = Scene { gaussians: host.gaussians.clone(), background: host.background };
             let pixels = reference::render(&scene, camera, &options, Cutoff::Hard);
-            plain =
-                plain.max(worst(&numbers, i, pixels.iter().map(|p| p.channels().map(f64::from)), &banded));
+            plain = plain.max(worst(&numbers, i, pixels.iter().map(|p| p.map(f64::from)), &banded));
             let upstream = upstream(&numbers, i).concat();
             let pass = host.pass(std::slice::from_ref(camera), &options, &upstream, &device);
             let found = pass.image.chunks(5).map(|p| std::array::from_fn(|c| f64::from(p[c])));
@@ -188,12 +187,7 @@ fn the_oracles_gradients_agree_with_finite_differences() {
             random_upstream(320, seed).chunks(5).map(|c| std::array::from_fn(|k| f64::from(c[k]))).collect();
         let loss = |scene: &Scene<f64>| -> f64 {
             let pixels = reference::render(scene, &camera, &options, Cutoff::Smooth);
-            pixels
-                .iter()
-                .zip(&upstream)
-                .flat_map(|(p, u)| p.channels().into_iter().zip(u))
-                .map(|(p, u)| p * u)
-                .sum()
+            pixels.iter().zip(&upstream).flat_map(|(p, u)| p.iter().zip(u)).map(|(p, u)| p * u).sum()
         };
         let gradient = reference::gradient(&scene, &camera, &options, Cutoff::Smooth, &upstream);
         let check = |what: String, analytic: f64, difference: f64| {
@@ -239,7 +233,7 @@ fn check(name: &str, host: &HostScene, camera: &Camera, options: &RenderOptions)
     let expected = reference::render(&scene, camera, options, Cutoff::Hard);
     let mut worst = 0.0_f64;
     for (pixel, (found, expected)) in pass.image.chunks(5).zip(&expected).enumerate() {
-        for (f, e) in found.iter().zip(expected.channels()) {
+        for (f, e) in found.iter().zip(*expected) {
             if !banded[pixel] {
                 worst = worst.max(distance(f64::from(*f), e));
             }
@@ -256,7 +250,7 @@ fn check(name: &str, host: &HostScene, camera: &Camera, options: &RenderOptions)
     let plain = reference::render(&plain, camera, options, Cutoff::Hard);
     let mut plain_worst = 0.0_f64;
     for ((found, expected), _) in plain.iter().zip(&expected).zip(&banded).filter(|(_, banded)| !**banded) {
-        for (f, e) in found.channels().iter().zip(expected.channels()) {
+        for (f, e) in found.iter().zip(*expected) {
             plain_worst = plain_worst.max(distance(f64::from(*f), e).min(9.0));
         }
     }

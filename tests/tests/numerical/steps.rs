@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::DataConfig;
-use snapsnap_net::config::{Anchor, Body, Sides};
+use snapsnap_net::config::{Anchor, Body, Precision, Sides};
 use snapsnap_net::network::{PointMap, View, activate};
 use snapsnap_net::weights::{random_predictor, random_regressors};
 use snapsnap_net::{Prediction, Window};
@@ -20,11 +20,9 @@ use snapsnap_tests::{TRAINING, device, device_name, is_software, relative_error,
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::gradients;
 use snapsnap_train::networks::{Networks, Rows};
-use snapsnap_train::photometric::Photometric;
 use snapsnap_train::points::losses;
-use snapsnap_train::precision::{Precision, lower};
 use snapsnap_train::stage1::PointTask;
-use snapsnap_train::stage2::GaussianTask;
+use snapsnap_train::stage2::{self, GaussianTask};
 use snapsnap_train::task::{Moment, Task};
 
 fn config() -> TrainConfig {
@@ -222,7 +220,7 @@ fn sixteen_bits_have_the_same_gradients_but_for_rounding() {
     let networks = Networks { predictor, regressors: Vec::new() };
     let task = PointTask::new(from_ref(&folder), &config, &device).expect("a task");
     let made = |precision: Precision| {
-        let loss = loss(&task, &lower(precision, &networks));
+        let loss = loss(&task, &networks.in_precision(precision));
         let value = f64::from(loss.clone().into_scalar::<f32>());
         let rows = gradients::collect(&networks, &mut loss.backward());
         (value, rows.into_iter().map(|(name, row)| (name, values(row))).collect::<BTreeMap<_, _>>())
@@ -310,9 +308,12 @@ fn gradients_of_the_losses_are_finite_differences() {
     }
 
     let target = tensor(&random(&[1, 2, 13, 12], 0.0..1.0, 4), [1, 2, 13, 12]);
-    let photometric = |image: Tensor<4>| Photometric::new(image, target.clone()).loss(0.8);
+    let photometric = |image: Tensor<4>| {
+        let [l1, ssim] = stage2::photometric(image, target.clone());
+        l1 * 0.8 + (1.0 - ssim) * 0.2
+    };
     check("photometric", &random(&[1, 2, 13, 12], 0.0..1.0, 5), [1, 2, 13, 12], photometric);
 
-    let needle = |scales: Tensor<2>| snapsnap_train::stage2::anisotropy_penalty(&scales, 2.0);
+    let needle = |scales: Tensor<2>| stage2::anisotropy_penalty(&scales, 2.0);
     check("needles", &random(&[6, 3], 0.01..1.0, 6), [6, 3], needle);
 }

@@ -4,10 +4,9 @@ use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_base::config::Schema;
-use snapsnap_net::config::Config;
-use snapsnap_net::regressor::Statistics;
+use snapsnap_net::config::{Config, Precision};
 use snapsnap_net::steps::Record;
-use snapsnap_net::weights::{Float, ImportOptions, SideHeads, WeightFile, import};
+use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
 use snapsnap_net::{Prediction, Window};
 use snapsnap_tests::{
     FIXTURE_VALUES, Numbers, data, device, fixture, is_software, relative_error, start_error, toml_config,
@@ -15,8 +14,8 @@ use snapsnap_tests::{
 };
 use snapsnap_train::networks::{Networks, Rows};
 use snapsnap_train::optimizer::OptimizerConfig;
-use snapsnap_train::photometric::Photometric;
 use snapsnap_train::schedule::Schedule;
+use snapsnap_train::stage2::photometric;
 use snapsnap_train::{gradients, points};
 
 use crate::distance;
@@ -34,7 +33,7 @@ fn predictor(device: &Device) -> (Config, Networks) {
     let delta = "network.delta=1.7".to_owned();
     let config = Config::from_toml(&text, "the fixture's config", &[delta]).expect("a config");
     let path = folder.path().join("weights.safetensors");
-    let options = ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 0, float: Float::F32 };
+    let options = ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 0, float: Precision::F32 };
     import(&[data("pipeline/stage1.pth")], &config, options, &path, &|_, _| ()).expect("imports");
     let weights = WeightFile::open(&path, None).expect("opens");
     let predictor = weights.point_predictor(&device.clone().autodiff()).expect("loads");
@@ -168,7 +167,7 @@ fn gradients_of_the_regressor_are_the_authors() {
         WeightFile::open(&data("unet/weights.safetensors"), Some(Config::default())).expect("opens");
     let regressor = weights.regressors(&tracked).expect("loads").remove(0);
     let input = io.tensor::<4>("input", &tracked).require_grad();
-    let features = regressor.forward(input.clone(), &mut Statistics::measured());
+    let features = regressor.forward(input.clone());
     let (shape, upstream) = expected_gradients.f32("upstream");
     // `[B,H,W,14]`, as the features.
     assert_eq!(features.dims().as_slice(), shape.as_slice());
@@ -197,9 +196,9 @@ fn the_photometric_loss_is_the_authors() {
         Tensor::<4>::from_data(TensorData::new(values, shape), &tracked)
     };
     let image = read("image").require_grad();
-    let photometric = Photometric::new(image.clone(), read("target"));
-    let loss = photometric.loss(0.8);
-    for (name, got) in [("l1", &photometric.l1), ("ssim", &photometric.ssim), ("loss", &loss)] {
+    let [l1, ssim] = photometric(image.clone(), read("target"));
+    let loss = l1.clone() * 0.8 + (1.0 - ssim.clone()) * 0.2;
+    for (name, got) in [("l1", &l1), ("ssim", &ssim), ("loss", &loss)] {
         let (got, expected) = (f64::from(got.clone().into_scalar::<f32>()), numbers.f64(name).1[0]);
         println!("{name}: {got} instead of {expected}");
         assert!((got - expected).abs() <= 2e-6, "{name}: {got} instead of {expected}");

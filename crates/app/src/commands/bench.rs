@@ -11,6 +11,7 @@ use snapsnap_eval::bench::{Measured, dominated, measure};
 use snapsnap_eval::evaluate::LeftOut;
 
 use super::evaluate::{check_data, opened};
+use crate::arguments::check_utf8;
 use crate::failure::Failure;
 use crate::output::outside_data;
 use crate::progress::Progress;
@@ -104,7 +105,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     folder.finish(&report.json())?;
     for (m, by) in measured.iter().zip(dominated(&measured)) {
         let by = by.map_or("on the front".into(), |index| format!("dominated by {}", measured[index].name));
-        say::info(&format!("{:<24} {:>8.1} ms   {:>6.2} dB   {by}", m.name, 1e3 * m.p50, m.psnr));
+        say::info(&format!("{:<24} {:>8.1} ms   {:>6.2} dB   {by}", m.name, 1e3 * m.p50, m.score.psnr));
     }
     say::info(&format!("{}: report.md, report.json, plots and a table", folder.path.display()));
     complete(&report.failures(), "the rest was measured")
@@ -123,6 +124,7 @@ fn config_of(arguments: &Arguments) -> Result<BenchConfig, Failure> {
     if arguments.quick {
         config.bench = config.bench.quick();
     }
+    check_utf8(config.data.folders.iter().chain(&config.model.weights).chain(&config.training.runs))?;
     Ok(config)
 }
 

@@ -35,7 +35,7 @@ pub struct Arguments {
     #[arg(long, value_enum)]
     window: Option<Window>,
     /// Pixels around the mask instead of 8 of 1024.
-    #[arg(long, value_name = "PIXELS")]
+    #[arg(long, value_name = "PIXELS", requires = "mask")]
     margin: Option<usize>,
     #[command(flatten)]
     lpips: perceptual::Arguments,
@@ -67,9 +67,6 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         (Some(Window::Mask), None) => bail!("--window mask needs --mask MASK"),
         (Some(Window::All | Window::Paper), Some(_)) => bail!("--mask goes with --window mask alone"),
         _ => {}
-    }
-    if arguments.margin.is_some() && arguments.mask.is_none() {
-        bail!("--margin needs --mask");
     }
     let lpips = arguments.lpips.load(perceptual::FOLDER.as_ref(), &arguments.device)?;
     let Arguments { a, b, mask, .. } = arguments;

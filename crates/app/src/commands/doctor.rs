@@ -6,7 +6,7 @@ use burn::tensor::Device;
 use clap::Args;
 use serde_json::{Value, json};
 use snapsnap_eval::lpips::Lpips;
-use snapsnap_net::precision::cpu_has_bf16;
+use snapsnap_ops::bf16;
 
 use crate::arguments::ConfigArguments;
 use crate::device::{self, Adapter};
@@ -38,12 +38,6 @@ struct Weights {
 const GET_WEIGHTS: &str = "make them again with import-weights or init-weights, or train them; docs/formats.md describes their content";
 const GET_LPIPS: &str = "snapsnap fetch-weights alexnet lpips";
 
-/// A missing part and its remedy.
-struct Missing {
-    what: String,
-    mend: &'static str,
-}
-
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let graphics = device::adapters();
     let devices: Vec<Adapter> = device::processors().into_iter().chain(graphics.iter().cloned()).collect();
@@ -61,19 +55,20 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
             let (Ok(text) | Err(text)) = &w.state;
             json!({ "name": w.name, "sound": w.state.is_ok(), "description": text })
         };
+        let part = |(what, mend): &(String, &str)| json!({ "what": what, "mend": mend });
         let report = json!({
             "version": env!("CARGO_PKG_VERSION"),
             "commit": env!("SNAPSNAP_COMMIT"),
             "compiled_in": device::compiled_in(),
             "mpi": cfg!(feature = "mpi"),
             "threads": threads(),
-            "bf16": cpu_has_bf16(),
+            "bf16": bf16::is_there(),
             "memory_bytes": memory,
             "devices": devices.iter().map(device).collect::<Vec<Value>>(),
             "chosen": chosen,
             "why": why,
             "weights": weights.iter().map(weight).collect::<Vec<Value>>(),
-            "missing": missing.iter().map(|m| json!({ "what": m.what, "mend": m.mend })).collect::<Vec<Value>>(),
+            "missing": missing.iter().map(part).collect::<Vec<Value>>(),
         });
         say::json(&format!("{report:#}"))?;
         return broken(&weights);
@@ -88,7 +83,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         format!("threads      {}", threads()),
         format!(
             "bf16         {}",
-            if cpu_has_bf16() { "AVX-512" } else { "no instructions for it in this processor" }
+            if bf16::is_there() { "AVX-512" } else { "no instructions for it in this processor" }
         ),
         format!("memory       {}", gigabytes(memory)),
         "devices".into(),
@@ -112,7 +107,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         Err(text) => format!("! {}: {text}", w.name),
     }));
     lines.push(if missing.is_empty() { "nothing is missing" } else { "what could be better" }.into());
-    lines.extend(missing.iter().map(|Missing { what, mend }| format!("  {what}\n    {mend}")));
+    lines.extend(missing.iter().map(|(what, mend)| format!("  {what}\n    {mend}")));
     say::lines(&lines.join("\n"))?;
     broken(&weights)
 }
@@ -162,9 +157,10 @@ fn weights_found(arguments: &Arguments) -> Vec<Weights> {
     found
 }
 
-fn missing(graphics: &[Adapter], weights: &[Weights], memory: u64) -> Vec<Missing> {
+/// The missing parts, each with its remedy.
+fn missing(graphics: &[Adapter], weights: &[Weights], memory: u64) -> Vec<(String, &'static str)> {
     let mut missing = Vec::new();
-    let mut add = |what: &str, mend| missing.push(Missing { what: what.into(), mend });
+    let mut add = |what: &str, mend| missing.push((what.to_owned(), mend));
     if graphics.iter().all(|found| found.software) {
         let mend = if device::is_opengl() {
             "the card works with OpenGL only, which is not used: install its Vulkan driver (Debian, Ubuntu: apt-get install \

@@ -22,7 +22,7 @@ use snapsnap_eval::report::evaluation::{Cost, Evaluation};
 use snapsnap_eval::variant::Variant;
 use snapsnap_net::weights::WeightFile;
 
-use crate::arguments::{ConfigArguments, one_of};
+use crate::arguments::{ConfigArguments, check_utf8, one_of};
 use crate::failure::{Failure, bail};
 use crate::output::outside_data;
 use crate::pictures::write_png;
@@ -78,7 +78,7 @@ const REST: &str = "the rest, if there is any, was evaluated";
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let config = config_of(arguments)?;
     let (sets, mut missing) = data_sets(&config)?;
-    let roots = sets.iter().map(|set| set.folder().root());
+    let roots = sets.iter().map(|set| set.folder.root());
     outside_data(&arguments.output, roots.chain(config.baselines.mean.iter().map(PathBuf::as_path)))?;
     if let Some(meshes) = &arguments.mesh_dir {
         return judge_meshes(arguments, &config, &sets, meshes, missing);
@@ -102,7 +102,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
     let folder = ReportFolder::new(&arguments.output, &inputs)?;
 
-    let people = sets.iter().map(|set| set.chosen().len()).sum();
+    let people = sets.iter().map(|set| set.chosen.len()).sum();
     let progress = Progress::steps(people, "people");
     let done = |done: usize, total: usize| progress.step(done, total, "people");
     let start = Instant::now();
@@ -182,7 +182,7 @@ fn judge_meshes(
     }
     let folder = ReportFolder::new(&arguments.output, &[&arguments.config])?;
     let alignment = config.metrics.align.description();
-    let total = sets.iter().map(|set| set.chosen().len()).sum();
+    let total = sets.iter().map(|set| set.chosen.len()).sum();
     let progress = Progress::steps(total, "people");
     let done = |done: usize, total: usize| progress.step(done, total, "people");
     let (figures, mut left_out) = evaluate_meshes(config, sets, meshes, &done);
@@ -218,6 +218,7 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
         let photographs = Some(PhotographChanges { grey, ..config.photographs });
         config.ablations.insert("grey".into(), Variant { photographs, ..Variant::default() });
     }
+    check_utf8(config.data.folders.iter().chain(&config.model.weights).chain(&arguments.against))?;
     Ok(config)
 }
 
@@ -244,19 +245,19 @@ fn contestants(
         let model =
             opened(variant).and_then(|(weights, device)| Ok(Model::load(&weights, &device, variant)?));
         match model {
-            Ok(model) => contestants.push(Contestant::model(name, kind, model)),
+            Ok(model) => contestants.push(Contestant::Model(name.clone(), kind, Box::new(model))),
             Err(e) => missing.push(LeftOut::new(name, e)),
         }
     }
     if config.baselines.billboard {
-        contestants.push(Contestant::billboard(device));
+        contestants.push(Contestant::Billboard(device.clone()));
     }
     if config.baselines.true_points {
-        contestants.push(Contestant::true_points(device));
+        contestants.push(Contestant::TruePoints(device.clone()));
     }
     if !config.baselines.mean.is_empty() {
         match MeanPictures::new(&config.baselines.mean, sets) {
-            Ok(pictures) => contestants.push(Contestant::mean(pictures)),
+            Ok(pictures) => contestants.push(Contestant::Mean(pictures)),
             Err(e) => missing.push(LeftOut::new("mean_picture", e)),
         }
     }

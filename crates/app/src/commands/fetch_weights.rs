@@ -187,12 +187,17 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
     if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
         return Err(Failure::file(&part, "is being fetched by another process"));
     }
-    let filled = fill(&mut file, item, address, &Progress::bytes(), &part);
+    let filled = fill(&mut file, item, address, &Progress::bytes());
     // A later attempt continues from what has arrived.
     if filled.is_err() && file.metadata().is_ok_and(|there| there.len() == 0) {
         let _ = fs::remove_file(&part);
     }
-    filled?;
+    filled.map_err(|broken| match broken {
+        Broken::Write(e) => cannot_write(e),
+        Broken::Source(message) | Broken::Refused(message) => {
+            Failure::Internal(format!("{address}: {message}"))
+        }
+    })?;
     match check_sum(item, address, &mut file) {
         Ok(()) => {}
         Err(Broken::Write(e)) => return Err(cannot_write(e)),
@@ -268,47 +273,34 @@ fn take(
 }
 
 /// Downloads the rest of an unfinished file, in several attempts if connections break.
-fn fill(
-    file: &mut File,
-    item: &Item,
-    address: &str,
-    progress: &Progress,
-    part: &Path,
-) -> Result<(), Failure> {
-    let cannot_write = |e: io::Error| Failure::cannot_write(part, &e);
+fn fill(file: &mut File, item: &Item, address: &str, progress: &Progress) -> Result<(), Broken> {
     // Progress is counted from the largest length so far. Servers that restart the download make none.
     let (mut fruitless, mut most, mut time) = (0, 0, ATTEMPT[0]);
     loop {
-        let before = file.seek(SeekFrom::End(0)).map_err(cannot_write)?;
+        let before = file.seek(SeekFrom::End(0))?;
         if before == item.bytes {
             return Ok(());
         }
         if before > item.bytes {
-            file.set_len(0).map_err(cannot_write)?;
+            file.set_len(0)?;
             continue;
         }
         most = most.max(before);
         let why = match attempt(time, address, file, before, item, progress) {
             Ok(()) => "the connection ended early".to_owned(),
-            Err(Broken::Refused(message)) => {
-                return Err(Failure::Internal(format!("{address}: {message}")));
-            }
-            Err(Broken::Write(e)) => return Err(cannot_write(e)),
             Err(Broken::Source(message)) => message,
+            Err(broken) => return Err(broken),
         };
-        let after = file.metadata().map_err(cannot_write)?.len();
+        let after = file.metadata()?.len();
         if after >= item.bytes {
             return Ok(());
         }
         (fruitless, time) =
             if after > most { (0, ATTEMPT[1].min(2 * time)) } else { (fruitless + 1, ATTEMPT[0]) };
         if fruitless == ATTEMPTS {
-            if after == 0 {
-                let _ = fs::remove_file(part);
-            }
             let kept =
                 format!("{after} of {} bytes are kept; the next attempt continues from there", item.bytes);
-            return Err(Failure::Internal(format!("{address}: {why}; {kept}")));
+            return Err(Broken::Source(format!("{why}; {kept}")));
         }
         std::thread::sleep(Duration::from_millis(200 << fruitless));
     }

@@ -139,20 +139,18 @@ pub struct Target {
 impl Target {
     /// Refuses unknown kinds of meshes and unsuitable options.
     pub fn new(path: &Path, surface: &SurfaceArguments) -> Result<Self, Failure> {
+        let wrong = |message: &str| Err(Failure::file(path, message));
         let Some(kind) = Kind::named(path) else {
-            let message = "is neither .glb nor .obj nor .ply; the extension says what to write";
-            return Err(Failure::file(path, message));
+            return wrong("is neither .glb nor .obj nor .ply; the extension says what to write");
         };
         let name = path.file_name().unwrap_or_default().to_str();
         if kind == Kind::Obj && name.is_none_or(|name| name.contains(char::is_control)) {
-            let message = "an OBJ names its materials' file, so its own name must be plain text (UTF-8)";
-            return Err(Failure::file(path, message));
+            return wrong("an OBJ names its materials' file, so its own name must be plain text (UTF-8)");
         }
         let defaults = options(kind);
         let texture = surface.texture.map_or(defaults.texture, |side| side as usize);
         if texture > 0 && kind == Kind::Ply {
-            let message = "a PLY has no texture: leave out --texture, or write a .glb or .obj";
-            return Err(Failure::file(path, message));
+            return wrong("a PLY has no texture: leave out --texture, or write a .glb or .obj");
         }
         let bytes = TEXEL * (texture as u64).pow(2);
         memory::check(&format!("--texture {texture}"), bytes, "choose a smaller one")?;

@@ -17,7 +17,7 @@ use snapsnap_splat::scene::Stored;
 
 use super::convert::AxesArguments;
 use super::reconstruct::Arguments;
-use crate::batch::{Batch, pictures, stem, unpanicked};
+use crate::batch::{Batch, pictures, same_name, stem, unpanicked};
 use crate::failure::{Failure, bail};
 use crate::model::check_memory;
 use crate::progress::Progress;
@@ -252,10 +252,7 @@ fn in_folder(folder: &Path) -> Result<Vec<Job>, Failure> {
             continue;
         }
         if let Some(other) = found.insert(stem, path.clone()) {
-            return Err(Failure::file(
-                &path,
-                format_args!("has the same name as {}: rename one of them", other.display()),
-            ));
+            return Err(same_name(&path, &other));
         }
     }
     if others > 0 {

@@ -11,7 +11,8 @@ use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_mesh::picture;
 use snapsnap_net::config::Config;
-use snapsnap_net::precision::{Precision, cpu_has_bf16};
+use snapsnap_net::precision::Precision;
+use snapsnap_ops::bf16;
 use snapsnap_photo::{Cutting, Person, Photographs, Source, Told};
 use snapsnap_splat::scene::Stored;
 
@@ -19,13 +20,13 @@ use super::convert::AxesArguments;
 use super::mesh::{self, SurfaceArguments, Target};
 use super::pairs;
 use crate::batch::{KindArgument, ShardArgument, must_be_unused};
-use crate::camera_options::CameraArguments;
 use crate::failure::{Failure, bail};
-use crate::model::{ModelArguments, check_memory};
+use crate::model::{CameraArguments, ModelArguments, check_memory};
 use crate::output::{check_kind, check_outputs, is_same_file};
+use crate::pictures::{cutout_paths, save_cutout};
 use crate::progress::Progress;
 use crate::turntable::Turntable;
-use crate::{cutouts, device, dump, memory, output, say};
+use crate::{device, dump, memory, output, say};
 
 /// The output of one person.
 const DEFAULT_OUTPUT: &str = "human.ply";
@@ -132,7 +133,7 @@ fn in_words(precision: Precision, device: &Device) -> String {
     if precision != Precision::Bf16 || !memory::is_cpu(device) {
         return name.into();
     }
-    let by = match cpu_has_bf16() {
+    let by = match bf16::is_there() {
         true => "AVX-512",
         false => "f32 products of rounded weights: this processor has no bf16 instructions",
     };
@@ -165,7 +166,7 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
         bail!("--cutout network: --masks already tells the person from the background");
     }
     let told = arguments.camera.told(&config, arguments.as_is)?;
-    let saved = arguments.save_cutouts.as_deref().map(cutouts::paths).transpose()?;
+    let saved = arguments.save_cutouts.as_deref().map(cutout_paths).transpose()?;
     let config_path =
         check_paths(arguments, paths, output, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
     paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
@@ -177,7 +178,7 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     timed("photographs", since);
     let cutouts = std::mem::take(&mut photographs.cutouts);
     for (path, (rgb, mask)) in saved.iter().flatten().zip(&cutouts) {
-        cutouts::save(path, rgb, mask)?;
+        save_cutout(path, rgb, mask)?;
     }
     drop(cutouts);
     let since = Instant::now();

@@ -114,7 +114,7 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
         folder.map(|path| ViewFolder::new(path, views.len(), arguments.cameras.as_deref())).transpose()?;
     check_paths(arguments, folder.as_ref())?;
     if let (Some(path), Some([width, height])) = (&arguments.cameras, arguments.size)
-        && folder.as_ref().is_some_and(ViewFolder::keeps_cameras)
+        && folder.as_ref().is_some_and(|folder| folder.keeps_cameras)
         && camera_file::read(path)? != views
     {
         bail!(
@@ -268,11 +268,8 @@ struct Raw {
 impl Raw {
     fn new(path: &Path) -> Result<Self, Failure> {
         // The output's file system has room for the values. A pipe has no file system.
-        let folder = match path.parent() {
-            _ if file::is_special(path) => std::env::temp_dir(),
-            Some(folder) if !folder.as_os_str().is_empty() => folder.into(),
-            _ => ".".into(),
-        };
+        let is_special = file::is_special(path);
+        let folder = if is_special { std::env::temp_dir() } else { file::folder_of(path).to_owned() };
         let part = || tempfile::tempfile_in(&folder).map_err(|e| Failure::cannot_write(path, &e));
         let parts = [part()?, part()?, part()?].map(BufWriter::new);
         Ok(Self { path: path.to_owned(), parts })

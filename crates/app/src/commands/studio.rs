@@ -18,10 +18,9 @@ use snapsnap_photo::{Content, Cutting, Source, Told, cut_out, person};
 use snapsnap_splat::scene::Stored;
 use ureq::http::StatusCode;
 
-use crate::camera_options::CameraArguments;
 use crate::downloads::{self, Download};
 use crate::failure::Failure;
-use crate::model::{ModelArguments, check_memory};
+use crate::model::{CameraArguments, ModelArguments, check_memory};
 use crate::page::{self, Job, PageArguments, text};
 use crate::server::{Answer, Body, Refusal, Request};
 
@@ -70,9 +69,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         made: AtomicUsize::new(0),
         start: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos()),
     };
-    page::show(page::Kind::Studio, &arguments.page, "the studio is open", &|request, body| {
-        studio.respond(request, body).unwrap_or_else(|refused| refused)
-    })
+    let rest = |request: &Request, body: &mut Body| studio.respond(request, body);
+    page::show("studio", &arguments.page, "the studio is open", &rest)
 }
 
 impl Studio {

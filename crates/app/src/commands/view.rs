@@ -44,9 +44,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     // Refuses unsuitable files before the browser starts.
     finite(input)?;
     let shows = format!("shows {}", input.display());
-    page::show(page::Kind::View, &arguments.page, &shows, &|request, _| {
-        respond(request, input).unwrap_or_else(|refused| refused)
-    })
+    page::show("view", &arguments.page, &shows, &|request, _| respond(request, input))
 }
 
 fn respond(request: &Request, input: &Path) -> Result<Answer, Answer> {

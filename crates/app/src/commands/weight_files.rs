@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use snapsnap_base::config::Schema;
-use snapsnap_net::config::Config;
-use snapsnap_net::weights::{self, Float, ImportOptions, SideHeads};
+use snapsnap_net::config::{Config, Precision};
+use snapsnap_net::weights::{self, ImportOptions, SideHeads};
 
 use crate::arguments::{ConfigArguments, one_of};
 use crate::failure::Failure;
@@ -83,7 +83,7 @@ pub fn import(arguments: &ImportArguments) -> Result<(), Failure> {
     let inputs: Vec<&Path> =
         sources.iter().chain(fill).chain(&arguments.config.config).map(PathBuf::as_path).collect();
     check_outputs(&[output], &inputs)?;
-    let float = if arguments.half { Float::F16 } else { Float::F32 };
+    let float = if arguments.half { Precision::F16 } else { Precision::F32 };
     let options = ImportOptions {
         fill: fill.as_deref(),
         side_heads: arguments.side_heads,

@@ -10,13 +10,14 @@
 //! the sample's key, and the rest its field. Archives of a set without splits begin with `all`.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
 use snapsnap_base::{FileError, file, quoted};
+use snapsnap_people::files::entries;
 
 use super::{MAX_FILE, Split};
 
@@ -83,12 +84,9 @@ pub fn path_of(archive: &str, member: &str) -> Option<PathBuf> {
 
 /// Names of the archives in a folder, in order.
 fn archives_in(root: &Path) -> Result<Vec<String>, FileError> {
-    let entries =
-        fs::read_dir(root).and_then(Iterator::collect::<Result<Vec<_>, _>>).map_err(FileError::read(root))?;
-    let names = entries.into_iter().map(|entry| entry.file_name().to_string_lossy().into_owned());
-    let mut names: Vec<String> = names.filter(|name| folder_of(name).is_some()).collect();
-    names.sort_unstable();
-    Ok(names)
+    let entries = entries(root)?;
+    let names = entries.iter().filter_map(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
+    Ok(names.filter(|name| folder_of(name).is_some()).collect())
 }
 
 /// Place of a file.
@@ -197,15 +195,14 @@ impl Archives {
         let mut members = tar::Archive::new(&header[..]);
         let member = members.entries().ok().and_then(|mut entries| entries.next()?.ok());
         let found = member.map(|member| (member.path_bytes().into_owned(), member.header().size()));
-        match found {
-            Some((name, Ok(length))) if length == place.length => {
-                let name = String::from_utf8_lossy(&name).into_owned();
-                let file = archive.file_name().unwrap_or_default().to_string_lossy();
-                if path_of(&file, &name).as_deref() == Some(path) {
-                    return Ok((archive.join(name), self.part(place, BLOCK, length)?));
-                }
+        if let Some((name, Ok(length))) = found
+            && length == place.length
+        {
+            let name = String::from_utf8_lossy(&name).into_owned();
+            let file = archive.file_name().unwrap_or_default().to_string_lossy();
+            if path_of(&file, &name).as_deref() == Some(path) {
+                return Ok((archive.join(name), self.part(place, BLOCK, length)?));
             }
-            _ => {}
         }
         let message = format!("has no {} at byte {}, where {INDEX} has it", path.display(), place.offset);
         Err(FileError::unsuitable(archive, message))

@@ -44,11 +44,6 @@ pub enum Arrangement {
 }
 
 impl Arrangement {
-    #[allow(clippy::trivially_copy_pass_by_ref, reason = "serde's signature")]
-    fn is_ring(&self) -> bool {
-        *self == Self::Ring
-    }
-
     /// Front, back, right and left of a sample whose front is view `first` of `count`.
     pub fn four(self, first: usize, count: usize) -> [usize; 4] {
         match self {
@@ -99,14 +94,14 @@ pub struct Description {
     /// Views of each subject.
     pub views: usize,
     /// Arrangement of the views around the subject.
-    #[serde(default, skip_serializing_if = "Arrangement::is_ring")]
+    #[serde(default, skip_serializing_if = "is_default")]
     pub arrangement: Arrangement,
     /// Side of a view in pixels.
     pub resolution: u32,
     /// Whether each view is stored at twice the side as well.
     pub high_resolution: bool,
     /// Whether the depth of the second surface that faces the camera is stored as well.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    #[serde(default, skip_serializing_if = "is_default")]
     pub second_depth: bool,
     /// Camera coordinates of the first pixel's sample: 0 in the authors' sets, ½ in the exact layout. Points from depth
     /// are half a pixel off without this correction.
@@ -131,8 +126,8 @@ pub struct Drawn {
     pub light: LightConfig,
 }
 
-fn is_default(light: &LightConfig) -> bool {
-    *light == LightConfig::default()
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 impl Description {

@@ -8,7 +8,7 @@ use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageBuffer, ImageEncoder, Luma, RgbImage};
 use ndarray::{Array2, ArrayView2};
-use ndarray_npy::{ReadNpyExt, WriteNpyExt};
+use ndarray_npy::{ReadNpyExt, ReadableElement, WriteNpyExt};
 use snapsnap_splat::{Camera, RigidTransform};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
@@ -93,6 +93,14 @@ pub fn write_inverse_depth(path: &Path, view: &View) -> Result<(), FileError> {
     write_png(path, &bytes, (view.width, view.height), ExtendedColorType::L16)
 }
 
+/// The array in an `.npy`.
+fn read_array<T: ReadableElement>(npy: &[u8]) -> Result<Array2<T>, String> {
+    if !holds_its_shape(npy) {
+        return Err("its header announces more numbers than it contains".into());
+    }
+    Array2::read_npy(npy).map_err(|e| e.to_string())
+}
+
 /// Whether an `.npy` is long enough for the shape in its header, at four bytes per number. Its reader allocates memory
 /// before it checks this.
 fn holds_its_shape(npy: &[u8]) -> bool {
@@ -155,10 +163,7 @@ pub fn read_depth(Stored { path, bytes }: &Stored) -> Result<Depth, FileError> {
     let mut npy = Vec::new();
     // An entry longer than the largest depth map is cut off here and refused below.
     entry.take(MAX_NPY).read_to_end(&mut npy).map_err(|e| wrong(&e))?;
-    if !holds_its_shape(&npy) {
-        return Err(wrong(&"its header announces more numbers than it contains"));
-    }
-    let array = Array2::<f32>::read_npy(npy.as_slice()).map_err(|e| wrong(&e))?;
+    let array = read_array::<f32>(&npy).map_err(|e| wrong(&e))?;
     let (height, width) = array.dim();
     let array = array.as_standard_layout().into_owned();
     Ok((array.into_raw_vec_and_offset().0, [height as u32, width as u32]))
@@ -186,12 +191,8 @@ pub fn write_camera(folder: &Path, view: usize, camera: &Camera) -> Result<(), F
 /// Reads the files of [`write_camera`]. The authors' tools store some matrices in f32.
 pub fn read_camera(intrinsic: &Stored, extrinsic: &Stored, side: u32) -> Result<Camera, FileError> {
     let load = |Stored { path, bytes }: &Stored, shape: (usize, usize)| {
-        if !holds_its_shape(bytes) {
-            let message = "is no matrix: its header announces more numbers than it contains";
-            return Err(FileError::unsuitable(path, message));
-        }
-        let matrix = Array2::<f64>::read_npy(bytes.as_slice())
-            .or_else(|e| Array2::<f32>::read_npy(bytes.as_slice()).map(|m| m.mapv(f64::from)).map_err(|_| e));
+        let matrix =
+            read_array(bytes).or_else(|e| read_array::<f32>(bytes).map(|m| m.mapv(f64::from)).map_err(|_| e));
         let matrix = matrix.map_err(|e| FileError::unsuitable(path, format!("is no matrix: {e}")))?;
         if matrix.dim() != shape {
             let (rows, columns) = matrix.dim();

@@ -56,7 +56,8 @@ pub fn pack(
     }
     let output = &file::target_of(output);
     let _guard = file::unfinished_folder(output).map_err(FileError::write(output))?;
-    let mut packer = Packer::new(folder, output, size)?;
+    let index = csv::Writer::from_writer(create(&output.join(INDEX))?);
+    let mut packer = Packer { folder, output, size, index, open: None, next: 0, packed: Packed::default() };
     let pack = || {
         for (done, (split, subject)) in all.iter().enumerate() {
             progress(done, all.len());
@@ -98,12 +99,7 @@ fn create(path: &Path) -> Result<BufWriter<File>, FileError> {
     File::create_new(path).map(BufWriter::new).map_err(FileError::write(path))
 }
 
-impl<'a> Packer<'a> {
-    fn new(folder: &'a Folder, output: &'a Path, size: u64) -> Result<Self, FileError> {
-        let index = csv::Writer::from_writer(create(&output.join(INDEX))?);
-        Ok(Self { folder, output, size, index, open: None, next: 0, packed: Packed::default() })
-    }
-
+impl Packer<'_> {
     fn add(&mut self, split: Option<Split>, subject: &str) -> Result<(), FileError> {
         let person = self.folder.person(split, subject);
         if subject.contains('.') {

@@ -2,9 +2,8 @@ mod pack;
 
 use super::*;
 use crate::prepare::{DataConfig, Subject};
-use crate::testing::{block, data_set, made, rectangle};
+use crate::testing::{block, data_set, made, rectangle, two_blocks};
 use glam::Vec3;
-use snapsnap_mesh::mesh::Face;
 use snapsnap_splat::{Camera, camera_file};
 
 const TRAIN: Option<Split> = Some(Split::Train);
@@ -50,12 +49,8 @@ fn what_was_written_is_read_again() {
 fn second_surfaces_are_stored_and_checked() {
     let mut config = DataConfig::default();
     (config.views.count, config.views.resolution, config.views.second_depth) = (2, 64, true);
-    let mut mesh = block();
-    let first = mesh.positions.len() as u32;
     // A thin slab in front of the block.
-    let slab = block();
-    mesh.positions.extend(slab.positions.iter().map(|p| *p * Vec3::new(0.5, 1.0, 0.2) + 0.4 * Vec3::Z));
-    mesh.faces.extend(slab.faces.iter().map(|f| Face { positions: f.positions.map(|r| r + first), ..*f }));
+    let mesh = two_blocks(|p| p * Vec3::new(0.5, 1.0, 0.2) + 0.4 * Vec3::Z);
     let (_temporary, folder) = made(&config, &mesh, 1);
     let person = folder.person(TRAIN, "0000");
     let of = |view: usize| {
@@ -109,19 +104,6 @@ fn folders_of_the_authors_tools_are_recognised() {
     ndarray_npy::write_npy(&path, &matrix).expect("writes");
     let again = person.camera(0).expect("reads");
     assert!((again.world_to_camera.translation - camera.world_to_camera.translation).length() < 1e-6);
-}
-
-#[test]
-fn the_authors_layout_needs_the_number_of_views_in_the_folders_name() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let mut config = DataConfig::default();
-    config.views.layout = Layout::Authors;
-    let create = |name: &str| Folder::create(&temporary.path().join(name), config.description("a test"));
-    assert!(create("people").expect_err("refused").to_string().contains("must end in `_1024_24`"));
-    assert!(create("people_1024_24").is_ok());
-    let other = DataConfig::default().description("a test");
-    let error = Folder::create(&temporary.path().join("people_1024_24"), other).expect_err("another");
-    assert!(error.to_string().contains("describes another data set"), "{error}");
 }
 
 #[test]

@@ -23,17 +23,6 @@ pub enum Made {
     Elsewhere,
 }
 
-/// Removes the folder of a killed run and the folder's lock `mark`, which has the folder's name and the extension
-/// `lock`. A folder of a run in progress stays.
-fn remove_left(mark: &Path) {
-    let Ok(lock) = fs::File::open(mark) else { return };
-    // A run in progress holds its lock. This one is held until the folder is removed.
-    if lock.try_lock().is_ok() {
-        let _ = fs::remove_dir_all(mark.with_extension(""));
-        let _ = fs::remove_file(mark);
-    }
-}
-
 impl Folder {
     /// Whether the subject is complete: the last view has a file of every kind.
     pub fn has(&self, split: Split, subject: &str) -> bool {
@@ -83,10 +72,9 @@ impl Folder {
         // The system releases the lock of a killed run.
         let mark = unfinished.join(format!("{split}-{subject}.lock"));
         let lock = fs::File::create(&mark).map_err(FileError::write(&mark))?;
-        match lock.try_lock() {
-            Err(TryLockError::WouldBlock) => return Ok(Made::Elsewhere),
-            // Some file systems have no locks. Two runs may then write the same subject.
-            Err(TryLockError::Error(_)) | Ok(()) => {}
+        // Some file systems have no locks. Two runs may then write the same subject.
+        if matches!(lock.try_lock(), Err(TryLockError::WouldBlock)) {
+            return Ok(Made::Elsewhere);
         }
         let mark = file::unfinished_file(&mark);
         if self.has(split, subject) {
@@ -112,8 +100,15 @@ impl Folder {
     pub fn tidy(&self) {
         let unfinished = self.root.join(UNFINISHED);
         for mark in fs::read_dir(&unfinished).into_iter().flatten().flatten().map(|entry| entry.path()) {
-            if mark.extension().is_some_and(|extension| extension == "lock") {
-                remove_left(&mark);
+            // The lock of a folder has the folder's name and the extension `lock`.
+            if mark.extension().is_none_or(|extension| extension != "lock") {
+                continue;
+            }
+            let Ok(lock) = fs::File::open(&mark) else { continue };
+            // A run in progress holds its lock. This one is held until the folder is removed.
+            if lock.try_lock().is_ok() {
+                let _ = fs::remove_dir_all(mark.with_extension(""));
+                let _ = fs::remove_file(mark);
             }
         }
         let _ = fs::remove_dir(unfinished);

@@ -67,15 +67,19 @@ impl Augment {
         let gain = Vec3::new(stray(balance), 1.0, stray(balance)) * exposure;
         let grow = random.random_range(-1.0_f32..1.0);
         let quality = random.random_range(0.0_f32..1.0);
-        let backdrop = Backdrop::draw(random);
+        // A smooth background between two colours.
+        let colors = [(); 2].map(|()| 255.0 * Vec3::new(random.random(), random.random(), random.random()));
+        let way: [f32; 2] = [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0)];
+        let backdrop = |x: f32, y: f32| {
+            colors[0].lerp(colors[1], (0.5 + (x - 0.5) * way[0] + (y - 0.5) * way[1]).clamp(0.0, 1.0))
+        };
         let mut picture = color.clone();
         if self.is_photographic || gain != Vec3::ONE {
             for (x, y, pixel) in picture.enumerate_pixels_mut() {
                 let lit = (Vec3::from(pixel.0.map(f32::from)) * gain).clamp(Vec3::ZERO, Vec3::splat(255.0));
                 let mixed = if self.is_photographic {
                     let share = f32::from(mask.get_pixel(x, y).0[0]) / 255.0;
-                    backdrop
-                        .color(x as f32 / color.width() as f32, y as f32 / color.height() as f32)
+                    backdrop(x as f32 / color.width() as f32, y as f32 / color.height() as f32)
                         .lerp(lit, share)
                 } else {
                     lit
@@ -89,25 +93,6 @@ impl Augment {
         let reach = if grow < 0.0 { grow * self.mask_erosion } else { grow * self.mask_dilation };
         let mask = if reach == 0.0 { mask.clone() } else { moved(mask, reach) };
         (picture, mask)
-    }
-}
-
-/// A smooth background between two colours.
-struct Backdrop {
-    colors: [Vec3; 2],
-    way: [f32; 2],
-}
-
-impl Backdrop {
-    fn draw(random: &mut impl Rng) -> Self {
-        let mut color = || 255.0 * Vec3::new(random.random(), random.random(), random.random());
-        let colors = [color(), color()];
-        Self { colors, way: [random.random_range(-1.0..1.0), random.random_range(-1.0..1.0)] }
-    }
-
-    fn color(&self, x: f32, y: f32) -> Vec3 {
-        let [a, b] = self.colors;
-        a.lerp(b, (0.5 + (x - 0.5) * self.way[0] + (y - 0.5) * self.way[1]).clamp(0.0, 1.0))
     }
 }
 

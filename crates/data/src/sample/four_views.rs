@@ -22,12 +22,9 @@ pub(super) struct FourViews {
     pub photographs: [Photograph; 2],
     /// Cameras of front, back, right and left.
     pub cameras: [Camera; 4],
-    /// Points `[4,H,W,3]` in metres in the front camera's frame, and their validity `[4,H,W]`; 2 without sides. Empty
-    /// without `points` of the config.
-    pub first: Points,
-    /// Points `[2,H,W,3]` and validity `[2,H,W]` of the second surfaces of right and left. Empty without sides or
-    /// without `network.second_layer`.
-    pub second: Points,
+    /// Points `[V,H,W,3]` in metres in the front camera's frame, and their validity `[V,H,W]`: V is 4, 2 without sides,
+    /// or 6 with the second surfaces of right and left. Empty without `points` of the config.
+    pub points: Points,
     /// Moves upright points back to the photographed person.
     pub restoration: Option<Restoration>,
 }
@@ -71,20 +68,20 @@ impl Source {
             }
             Ok::<_, FileError>(())
         };
-        let [mut first, mut second] = <[Points; 2]>::default();
+        let mut points = Points::default();
         for i in 0..count {
-            add_map(&mut first, "depth", i)?;
-        }
-        if self.config.second_depth && count == 4 {
-            add_map(&mut second, "depth2", 2)?;
-            add_map(&mut second, "depth2", 3)?;
+            add_map(&mut points, "depth", i)?;
         }
         if compat {
             let masks = pictures[..count].iter().flat_map(|(_, mask)| mask.as_raw());
-            first.1 = masks.map(|share| f32::from(u8::from(*share >= INSIDE))).collect();
+            points.1 = masks.map(|share| f32::from(u8::from(*share >= INSIDE))).collect();
+        }
+        if self.config.second_depth && count == 4 {
+            add_map(&mut points, "depth2", 2)?;
+            add_map(&mut points, "depth2", 3)?;
         }
         let photographs: [Photograph; 2] = photographs.canvases.try_into().expect("two photographs");
-        Ok(FourViews { photographs, cameras, first, second, restoration })
+        Ok(FourViews { photographs, cameras, points, restoration })
     }
 }
 

@@ -29,7 +29,7 @@ pub use photograph_changes::{PhotographChanges, Road};
 use snapsnap_base::FileError;
 use snapsnap_base::config::outside;
 use snapsnap_base::random::stream;
-pub use stage1::{Stage1, Stage1Batch, Stage1Batcher, Stage1Item};
+pub use stage1::{Stage1, Stage1Batch, Stage1Item};
 pub use stage2::{Stage2, Stage2Item};
 pub use test_set::{Test, TestItem};
 

@@ -48,6 +48,13 @@ pub struct PhotographChanges {
 impl PhotographChanges {
     /// The first invalid key, and why it is invalid.
     pub fn problem(&self) -> Option<(&'static str, String)> {
+        // Photographs of a user come without masks, and only masks say where the frame cuts the person off.
+        let of_masks = [("mask", self.mask), ("cut", self.cut)];
+        if let Some((key, _)) =
+            of_masks.into_iter().find(|(_, value)| self.road == Road::User && *value != 0.0)
+        {
+            return Some((key, "must be 0 with `photographs.road = \"user\"`, which uses no masks".into()));
+        }
         let background = self.background.unwrap_or_default().map(|value| ("background", value, 0.0..=1.0));
         outside([
             ("exposure", self.exposure, -4.0..=4.0),
@@ -134,6 +141,15 @@ mod tests {
         assert_eq!(grown.get_pixel(2, 0).0, [255]);
         let wrong = PhotographChanges { background: Some([0.0, 1.5, 0.5]), ..changes };
         assert!(wrong.problem().is_some_and(|(key, message)| key == "background" && message.contains("1.5")));
+    }
+
+    #[test]
+    fn the_road_of_a_user_has_no_masks_to_change() {
+        let user = PhotographChanges { road: Road::User, ..PhotographChanges::default() };
+        assert_eq!(user.problem(), None);
+        let key = |changes: PhotographChanges| changes.problem().expect("refused").0;
+        assert_eq!(key(PhotographChanges { mask: 3.0, ..user }), "mask");
+        assert_eq!(key(PhotographChanges { cut: 0.1, ..user }), "cut");
     }
 
     #[test]

@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use burn::data::dataloader::batcher::Batcher;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng;
 
@@ -26,16 +25,11 @@ pub struct Stage1Item {
     pub images: Vec<f32>,
     /// `[2,H,W]` input masks: the person's share of each pixel; 1 or 0 with `compat`.
     pub masks: Vec<f32>,
-    /// `[4,H,W,3]` points of front, back, right and left in the front camera's frame, metres; `[2,H,W,3]` without
-    /// sides.
+    /// `[V,H,W,3]` points in the front camera's frame, metres. V is 4: front, back, right and left. It is 2 without sides,
+    /// and 6 with the second surfaces that face the cameras of right and left (`network.second_layer`).
     pub points: Vec<f32>,
-    /// `[4,H,W]` or `[2,H,W]`: 1 for pixels that have a point, 0 for others.
+    /// `[V,H,W]`: 1 for pixels that have a point, 0 for others.
     pub valid: Vec<f32>,
-    /// `[2,H,W,3]` points of the second surfaces that face the cameras of right and left, as `points`. Empty without
-    /// `network.second_layer`.
-    pub second_points: Vec<f32>,
-    /// `[2,H,W]` as `valid`, for `second_points`.
-    pub second_valid: Vec<f32>,
 }
 
 /// A batch of B samples on a device.
@@ -69,11 +63,8 @@ impl Stage1Item {
     /// 5 are the second surfaces of right and left. `None` for a view that the sample does not contain.
     pub fn truth(&self, view: usize) -> Option<(&[f32], &[f32])> {
         let area = self.side * self.side;
-        let (points, valid, row) = match view {
-            0..4 => (&self.points, &self.valid, view),
-            _ => (&self.second_points, &self.second_valid, view - 4),
-        };
-        Some((points.get(3 * row * area..3 * (row + 1) * area)?, valid.get(row * area..(row + 1) * area)?))
+        let (first, end) = (view * area, (view + 1) * area);
+        Some((self.points.get(3 * first..3 * end)?, self.valid.get(first..end)?))
     }
 
     fn new(source: &Source, index: usize) -> Result<Self, FileError> {
@@ -81,12 +72,11 @@ impl Stage1Item {
         let front = source.front(&mut random);
         let side = source.folder.description().resolution as usize;
         let views = source.four_views(person, source.order(front), &mut random)?;
-        let FourViews { photographs, first: (points, valid), second, .. } = views;
+        let FourViews { photographs, points: (points, valid), .. } = views;
         let images = photographs.each_ref().map(|photo| &*photo.rgb).concat();
         let masks = photographs.each_ref().map(|photo| &*photo.mask).concat();
-        let (second_points, second_valid) = second;
         let name = format!("{}: {}, view {front}", source.folder.root().display(), person.name);
-        let mut item = Self { name, side, images, masks, points, valid, second_points, second_valid };
+        let mut item = Self { name, side, images, masks, points, valid };
         if source.config.augment.flip && random.random() {
             item.flip();
         }
@@ -96,56 +86,45 @@ impl Stage1Item {
     /// Mirrors the sample in x, and swaps the two sides.
     fn flip(&mut self) {
         let (side, area) = (self.side, self.side * self.side);
-        for image in [&mut self.images, &mut self.masks, &mut self.valid, &mut self.second_valid] {
+        for image in [&mut self.images, &mut self.masks, &mut self.valid] {
             image.chunks_exact_mut(side).for_each(<[f32]>::reverse);
         }
-        let lines = self.points.chunks_exact_mut(3 * side);
-        for line in lines.chain(self.second_points.chunks_exact_mut(3 * side)) {
+        for line in self.points.chunks_exact_mut(3 * side) {
             let (points, _) = line.as_chunks_mut::<3>();
             points.reverse();
             points.iter_mut().for_each(|point| point[0] = -point[0]);
         }
-        // Views 2 and 3 are right and left.
-        let maps = [&mut self.points[6 * area..], &mut self.valid[2 * area..]];
-        for map in maps.into_iter().chain([&mut self.second_points[..], &mut self.second_valid[..]]) {
-            let (right, left) = map.split_at_mut(map.len() / 2);
-            right.swap_with_slice(left);
+        // Views 2 and 3 are right and left, 4 and 5 their second surfaces.
+        for (maps, size) in [(&mut self.points, 3 * area), (&mut self.valid, area)] {
+            for pair in maps[2 * size..].chunks_exact_mut(2 * size) {
+                let (right, left) = pair.split_at_mut(size);
+                right.swap_with_slice(left);
+            }
         }
     }
 }
 
-/// Makes batches of samples.
-#[derive(Debug, Clone, Copy)]
-pub struct Stage1Batcher;
-
-impl Batcher<Stage1Item, Stage1Batch> for Stage1Batcher {
-    fn batch(&self, items: Vec<Stage1Item>, device: &Device) -> Stage1Batch {
+impl Stage1Batch {
+    /// A batch of samples with the same views.
+    pub fn new(items: Vec<Stage1Item>, device: &Device) -> Self {
         let (b, side) = (items.len(), items.first().map_or(0, |item| item.side));
-        let values = items.first().map_or(0, |item| item.valid.len() + item.second_valid.len());
-        let views = values / (side * side).max(1);
-        let none: &[f32] = &[];
-        Stage1Batch {
-            images: stacked(&items, |item| [&item.images, none], [b, 2, 3, side, side], device),
-            masks: stacked(&items, |item| [&item.masks, none], [b, 2, side, side], device),
-            points: stacked(
-                &items,
-                |item| [&item.points, &item.second_points],
-                [b, views, side, side, 3],
-                device,
-            ),
-            valid: stacked(&items, |item| [&item.valid, &item.second_valid], [b, views, side, side], device),
+        let views = items.first().map_or(0, |item| item.valid.len()) / (side * side).max(1);
+        Self {
+            images: stacked(&items, |item| &item.images, [b, 2, 3, side, side], device),
+            masks: stacked(&items, |item| &item.masks, [b, 2, side, side], device),
+            points: stacked(&items, |item| &item.points, [b, views, side, side, 3], device),
+            valid: stacked(&items, |item| &item.valid, [b, views, side, side], device),
         }
     }
 }
 
-/// A tensor with the two fields of each item, one after the other.
+/// A tensor with a field of each item.
 fn stacked<const D: usize>(
     items: &[Stage1Item],
-    of: impl Fn(&Stage1Item) -> [&[f32]; 2],
+    field: impl Fn(&Stage1Item) -> &[f32],
     shape: [usize; D],
     device: &Device,
 ) -> Tensor<D> {
-    let parts: Vec<&[f32]> = items.iter().flat_map(of).collect();
-    let values = parts.concat();
-    Tensor::from_data(TensorData::new(values, shape), device)
+    let values: Vec<&[f32]> = items.iter().map(field).collect();
+    Tensor::from_data(TensorData::new(values.concat(), shape), device)
 }

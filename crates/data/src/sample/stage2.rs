@@ -81,7 +81,7 @@ impl Stage2Item {
             target_cameras.push(source.camera(&stored));
         }
         let views = source.four_views(person, order, &mut random)?;
-        let FourViews { photographs, mut cameras, first: (points, valid), restoration, .. } = views;
+        let FourViews { photographs, mut cameras, points: (points, valid), restoration } = views;
         if let Some(restoration) = &restoration {
             cameras[0] = restoration.front;
         }

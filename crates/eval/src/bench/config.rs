@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use snapsnap_base::config::Schema;
+use snapsnap_base::config::{Schema, outside};
 
 use crate::evaluate::config::{DataSection, EvalConfig, MetricsSection, Protocol, ViewsSection};
 use crate::variant::Variant;
@@ -106,16 +106,14 @@ impl Schema for BenchConfig {
     fn refusal(&self) -> Option<(String, String)> {
         let b = &self.bench;
         let counts = [
-            ("bench.runs", b.runs, 1, 10_000),
-            ("bench.warm_up", b.warm_up, 0, 1000),
-            ("bench.people", b.people, 1, 100_000),
-            ("bench.views", b.views, 1, 4096),
-            ("bench.oracle", b.oracle as usize, 1, 1024),
+            ("bench.runs", b.runs, 1..=10_000),
+            ("bench.warm_up", b.warm_up, 0..=1000),
+            ("bench.people", b.people, 1..=100_000),
+            ("bench.views", b.views, 1..=4096),
+            ("bench.oracle", b.oracle as usize, 1..=1024),
         ];
-        for (key, value, low, high) in counts {
-            if !(low..=high).contains(&value) {
-                return Some((key.into(), format!("is {value}, must be {low} to {high}")));
-            }
+        if let Some((key, message)) = outside(counts) {
+            return Some((key.into(), message));
         }
         if self.settings.contains_key(AS_IT_IS) {
             return Some(("settings".into(), format!("`{AS_IT_IS}` is the name of the model under test")));

@@ -57,15 +57,11 @@ pub struct Measured {
     pub render: f64,
     /// Number of Gaussians of the first person.
     pub gaussians: usize,
-    /// dB, protocol `masked`, mean over people and views.
-    #[serde(with = "crate::statistics::number")]
-    pub psnr: f64,
+    /// Protocol `masked`, mean over people and views.
+    #[serde(flatten)]
+    pub score: Score,
     /// PSNR of each person.
     pub people: Vec<PersonScore>,
-    /// Mean over people and views.
-    pub ssim: Option<f64>,
-    /// Mean over people and views.
-    pub lpips: Option<f64>,
     /// The weights of LPIPS, or the reason for their absence.
     pub lpips_weights: String,
     /// Mean distance of the predicted points of front and back from the ground truth, mm.
@@ -120,7 +116,7 @@ pub fn measure(
         [] => EvalError::Message(format!("{}: has no people", folder.display())),
         only => EvalError::Message(format!("{}: has no person named {}", folder.display(), only.join(", "))),
     };
-    let first = people.chosen().first().copied().ok_or_else(nobody)?;
+    let first = people.chosen.first().copied().ok_or_else(nobody)?;
 
     let (model, loading) = timed(1, || {
         let model = Model::load(weights, device, variant)?;
@@ -167,15 +163,13 @@ pub fn measure(
 
     let gaussians = made.gaussians.len();
     let plan = made.steps.iter().map(ToString::to_string).collect();
-    let contestant = Contestant::model(name, Kind::Model, model);
+    let contestant = Contestant::Model(name.into(), Kind::Model, Box::new(model));
     let outcome = evaluate(&eval, std::slice::from_ref(&people), &[contestant], lpips, &|_, _| ());
     let judged = &outcome.judged[0];
     let scores: Vec<Score> = judged.rows.iter().map(|row| row.scores[0]).collect();
-    let Score { psnr, ssim, lpips } =
-        Score::mean(&scores).ok_or_else(|| EvalError::Message("no view could be compared".into()))?;
+    let score = Score::mean(&scores).ok_or_else(|| EvalError::Message("no view could be compared".into()))?;
     let points = |sides: bool| {
-        let errors = judged.points.iter().flat_map(|(_, errors)| errors);
-        let errors = errors.filter(|error| (error.view > 1) == sides);
+        let errors = judged.points.iter().filter(|error| (error.view > 1) == sides);
         mean(&errors.map(|error| 1e3 * error.mean).collect::<Vec<_>>())
     };
     let of_person =
@@ -194,10 +188,8 @@ pub fn measure(
         memory,
         render,
         gaussians,
-        psnr,
+        score,
         people: by_person(&judged.rows, 0).into_iter().map(of_person).collect(),
-        ssim,
-        lpips,
         lpips_weights: lpips_weights.into(),
         points_mm: points(false),
         sides_mm: points(true),
@@ -248,7 +240,7 @@ pub fn dominated(measured: &[Measured]) -> Vec<Option<usize>> {
     };
     let by = |b: &Measured| {
         let better = measured.iter().enumerate().filter(|(_, a)| is_alike(a, b) && beats(a, b));
-        better.max_by(|a, b| a.1.psnr.total_cmp(&b.1.psnr)).map(|(place, _)| place)
+        better.max_by(|a, b| a.1.score.psnr.total_cmp(&b.1.score.psnr)).map(|(place, _)| place)
     };
     measured.iter().map(by).collect()
 }
@@ -262,7 +254,8 @@ mod tests {
     fn measured(p50: f64, psnr: f64) -> Measured {
         let person = |name: &str, psnr| PersonScore { name: name.into(), psnr };
         let people = vec![person("a", psnr), person("b", psnr + 2.0)];
-        Measured { p50, render: 1.0, psnr: psnr + 1.0, people, ..Measured::default() }
+        let score = Score { psnr: psnr + 1.0, ..Score::default() };
+        Measured { p50, render: 1.0, score, people, ..Measured::default() }
     }
 
     #[test]
@@ -293,6 +286,6 @@ mod tests {
     fn equal_pictures_travel_between_processes() {
         let text = serde_json::to_string(&measured(1.0, f64::INFINITY)).expect("JSON");
         let back: Measured = serde_json::from_str(&text).expect("the same");
-        assert!(back.psnr == f64::INFINITY && back.people[0].psnr == f64::INFINITY, "{text}");
+        assert!(back.score.psnr == f64::INFINITY && back.people[0].psnr == f64::INFINITY, "{text}");
     }
 }

@@ -26,10 +26,10 @@ pub(super) fn errors(
     let whole = RenderOptions { max_alpha: WHOLE, ..options.clone() };
     let smooth = reference::render(&scene, camera, &whole, Cutoff::Smooth);
     let (mut rounding, mut cutoffs) = (0.0_f64, 0.0_f64);
-    for (i, (hard, smooth)) in hard.iter().zip(&smooth).enumerate() {
-        for c in 0..3 {
-            rounding = rounding.max((f64::from(got[3 * i + c]) - hard.color[c]).abs());
-            cutoffs = cutoffs.max((hard.color[c] - smooth.color[c]).abs());
+    for ((hard, smooth), got) in hard.iter().zip(&smooth).zip(got.chunks_exact(3)) {
+        for ((hard, smooth), got) in hard.iter().zip(smooth).zip(got) {
+            rounding = rounding.max((f64::from(*got) - hard).abs());
+            cutoffs = cutoffs.max((hard - smooth).abs());
         }
     }
     Ok((rounding, cutoffs))

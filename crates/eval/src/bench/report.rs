@@ -115,9 +115,9 @@ impl Bench<'_> {
         const COLUMNS: &[Column] = &[
             ("knob", |m| m.knob.clone().unwrap_or_default()),
             ("setting", |m| m.name.clone()),
-            ("PSNR, dB", |m| format!("{:.2}", m.psnr)),
-            ("SSIM ×100", |m| scaled(m.ssim, 100.0)),
-            ("LPIPS ×100", |m| scaled(m.lpips, 100.0)),
+            ("PSNR, dB", |m| format!("{:.2}", m.score.psnr)),
+            ("SSIM ×100", |m| scaled(m.score.ssim, 100.0)),
+            ("LPIPS ×100", |m| scaled(m.score.lpips, 100.0)),
             ("front, back, mm", |m| scaled(m.points_mm, 1.0)),
             ("sides, mm", |m| scaled(m.sides_mm, 1.0)),
             ("reconstruction p50, ms", |m| format!("{:.1}", 1e3 * m.p50)),
@@ -157,8 +157,8 @@ impl Bench<'_> {
                     or_nothing(share(m.p50, whole.p50)),
                     memory.map_or("n/a".into(), |(now, _)| format!("{now:.0}")),
                     or_nothing(memory.map_or("n/a".into(), |(now, before)| share(now, before))),
-                    format!("{:.2}", m.psnr),
-                    or_nothing(format!("{:.2}", whole.psnr - m.psnr)),
+                    format!("{:.2}", m.score.psnr),
+                    or_nothing(format!("{:.2}", whole.score.psnr - m.score.psnr)),
                     points.map_or("n/a".into(), |(now, _)| format!("{now:.1}")),
                     or_nothing(points.map_or("n/a".into(), |(now, before)| format!("{:.1}", now - before))),
                     m.gaussians.to_string(),
@@ -212,9 +212,9 @@ impl Bench<'_> {
             ("omits", |m| m.omits.clone().unwrap_or_default()),
             ("people", |m| m.people.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(" ")),
             ("device", |m| m.device.clone()),
-            ("psnr", |m| m.psnr.to_string()),
-            ("ssim", |m| number(m.ssim)),
-            ("lpips", |m| number(m.lpips)),
+            ("psnr", |m| m.score.psnr.to_string()),
+            ("ssim", |m| number(m.score.ssim)),
+            ("lpips", |m| number(m.score.lpips)),
             ("points_mm", |m| number(m.points_mm)),
             ("sides_mm", |m| number(m.sides_mm)),
             ("p50_s", |m| m.p50.to_string()),
@@ -241,7 +241,7 @@ impl Bench<'_> {
 
     /// PSNR over run time with the Pareto front as a line; empty for less than two settings.
     fn pareto(&self) -> String {
-        let at = |m: &Measured| (1e3 * m.time(), m.psnr);
+        let at = |m: &Measured| (1e3 * m.time(), m.score.psnr);
         let by = dominated(self.measured);
         let plain = || self.measured.iter().zip(&by).filter(|(m, _)| m.scene.is_none());
         if plain().count() < 2 {

@@ -95,7 +95,7 @@ impl MeanPictures {
     pub fn new(folders: &[PathBuf], evaluated: &[People]) -> Result<Self, EvalError> {
         let views = evaluated.first().map_or(0, People::views);
         if let Some(set) = evaluated.iter().find(|set| set.views() != views) {
-            let (root, found) = (set.folder().root().display(), set.views());
+            let (root, found) = (set.folder.root().display(), set.views());
             let message = format!(
                 "{root} has {found} views, the data set before it {views}: mean pictures need equal views"
             );

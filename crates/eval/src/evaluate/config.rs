@@ -259,14 +259,13 @@ impl Schema for EvalConfig {
     const RENAMED: &'static [(&'static str, &'static str)] = &[("photographs.place", "photographs.road")];
 
     fn refusal(&self) -> Option<(String, String)> {
-        if let Some((key, message)) = self.problem() {
-            return Some((key.to_owned(), message));
-        }
-        self.ablations.iter().find_map(|(name, ablation)| {
+        let of_ablation = |(name, ablation): (&String, &Variant)| {
             let of_benchmarks = |key| (key, "only settings of `snapsnap bench` have this key".to_owned());
             let problem = ablation.refusal().or_else(|| ablation.key_of_benchmarks().map(of_benchmarks));
             problem.map(|(key, message)| (format!("ablations.{name}.{key}"), message))
-        })
+        };
+        let problem = self.problem().map(|(key, message)| (key.to_owned(), message));
+        problem.or_else(|| self.ablations.iter().find_map(of_ablation))
     }
 }
 
@@ -279,19 +278,15 @@ impl EvalConfig {
         let mut names: Vec<String> = ablations.keys().cloned().chain(devices).collect();
         names.sort_unstable();
         if let Some(name) = names.iter().find(|name| TAKEN.contains(&name.as_str())) {
-            return Some((
-                "ablations",
-                format!("`{name}` has another meaning in reports: choose another name"),
-            ));
+            let message = format!("`{name}` has another meaning in reports: choose another name");
+            return Some(("ablations", message));
         }
         if let Some(pair) = names.windows(2).find(|pair| pair[0] == pair[1]) {
             return Some(("ablations", format!("`{}` is the name of two ablations or devices", pair[0])));
         }
         if names.iter().chain(self.groups.keys()).any(|name| name.contains(char::is_control)) {
-            return Some((
-                "ablations",
-                "the name of an ablation, a device or a group has control characters".into(),
-            ));
+            let message = "the name of an ablation, a device or a group has control characters";
+            return Some(("ablations", message.into()));
         }
         if let Some((key, message)) = self.photographs.problem() {
             return Some(("photographs", format!("`{key}` {message}")));
@@ -309,11 +304,7 @@ impl EvalConfig {
                 metrics.protocols.is_empty(),
                 "is empty, must name `paper`, `masked` or both",
             ),
-            (
-                "metrics.protocols",
-                metrics.protocols.len() > 2 || metrics.protocols.get(1) == metrics.protocols.first(),
-                "names a protocol twice",
-            ),
+            ("metrics.protocols", names_twice(&metrics.protocols), "names a protocol twice"),
             ("metrics.opaque", !(0.0..=1.0).contains(&metrics.opaque), "must be 0 to 1"),
             (
                 "report.people",

@@ -9,7 +9,7 @@ use snapsnap_splat::{Camera, Gaussians};
 
 use super::baselines::{MeanPictures, billboard, true_points};
 use super::config::{MetricsSection, ViewsSection};
-use super::model::{Made, Model, no_gaussian};
+use super::model::{Model, no_gaussian};
 use super::person::{People, Points, nearest_view, photograph, points};
 use super::shared::rendered;
 use super::sides::side_points;
@@ -35,16 +35,14 @@ pub enum Kind {
 }
 
 /// A model or a baseline.
-pub struct Contestant {
-    /// The name in reports.
-    pub name: String,
-    means: Means,
-}
-
-enum Means {
-    Model(Kind, Box<Model>),
+pub enum Contestant {
+    /// The model under test or a variant of it, with its name in reports.
+    Model(String, Kind, Box<Model>),
+    /// The photographs as flat cut-outs.
     Billboard(Device),
+    /// Ground-truth points in the photographs' colours.
     TruePoints(Device),
+    /// Mean pictures of training people.
     Mean(MeanPictures),
 }
 
@@ -63,32 +61,19 @@ pub struct Shown {
 }
 
 impl Contestant {
-    /// The model under test or a variant of it.
-    pub fn model(name: &str, kind: Kind, model: Model) -> Self {
-        Self { name: name.into(), means: Means::Model(kind, Box::new(model)) }
-    }
-
-    /// The baseline of photographs as flat cut-outs.
-    pub fn billboard(device: &Device) -> Self {
-        Self { name: "billboard".into(), means: Means::Billboard(device.clone()) }
-    }
-
-    /// The baseline of ground-truth points in the photographs' colours.
-    pub fn true_points(device: &Device) -> Self {
-        Self { name: "true_points".into(), means: Means::TruePoints(device.clone()) }
-    }
-
-    /// The baseline of mean pictures of training people.
-    pub fn mean(pictures: MeanPictures) -> Self {
-        Self { name: "mean_picture".into(), means: Means::Mean(pictures) }
+    /// The name in reports.
+    pub(super) fn name(&self) -> &str {
+        match self {
+            Self::Model(name, ..) => name,
+            Self::Billboard(_) => "billboard",
+            Self::TruePoints(_) => "true_points",
+            Self::Mean(_) => "mean_picture",
+        }
     }
 
     /// The role in the report.
-    pub fn kind(&self) -> Kind {
-        match &self.means {
-            Means::Model(kind, _) => *kind,
-            _ => Kind::Baseline,
-        }
+    pub(super) fn kind(&self) -> Kind {
+        if let Self::Model(_, kind, _) = self { *kind } else { Kind::Baseline }
     }
 
     /// The result for a person's photographs. `canvas` is the side of the baselines' canvas in pixels. Models are
@@ -109,15 +94,18 @@ impl Contestant {
         let plain = |gaussians: Gaussians| {
             if gaussians.is_empty() { Err(no_gaussian()) } else { Ok(of(Some(gaussians))) }
         };
-        match &self.means {
-            Means::Model(_, model) => {
+        match self {
+            Self::Model(.., model) => {
                 let is_changed = model.photographs != PhotographChanges::default();
                 let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
                 let item = own.as_ref().unwrap_or(item);
                 let mut made = model.reconstruct(item, inputs)?;
                 let aligned = match metrics.align {
                     Align::None => None,
-                    _ => Some(aligned(&mut made, metrics, truth, &item.cameras[inputs[0]])?),
+                    _ => {
+                        let (gaussians, maps) = (&mut made.gaussians, &mut made.maps);
+                        Some(aligned(gaussians, maps, metrics, truth, &item.cameras[inputs[0]])?)
+                    }
                 };
                 // Pictures can be compared without errors of points.
                 let points = errors(people, row, item, inputs, &made.maps, model.side());
@@ -130,17 +118,17 @@ impl Contestant {
                     ..plain(made.gaussians)?
                 })
             }
-            Means::Billboard(device) => {
+            Self::Billboard(device) => {
                 let (photographs, valid) = on_canvas(item, inputs.len(), canvas);
                 let cameras: Vec<_> = inputs.iter().map(|view| item.cameras[*view]).collect();
                 plain(billboard(&photographs, &valid, canvas, &cameras, device))
             }
-            Means::TruePoints(device) => {
+            Self::TruePoints(device) => {
                 let mut views = inputs.to_vec();
                 if inputs.len() == 2 {
                     views.extend(SIDES.map(|azimuth| nearest_view(&item.cameras, inputs[0], azimuth)));
                 }
-                let Some((points, there)) = points(people.test(), row, &views, item.side, canvas)? else {
+                let Some((points, there)) = points(&people.test, row, &views, item.side, canvas)? else {
                     let message = format!("views of {}² give no points on a canvas of {canvas}²", item.side);
                     return Err(EvalError::Message(message));
                 };
@@ -152,7 +140,7 @@ impl Contestant {
                 let front = &item.cameras[inputs[0]];
                 plain(true_points(&photographs, &points, &valid, canvas, front, device))
             }
-            Means::Mean(_) => Ok(of(None)),
+            Self::Mean(_) => Ok(of(None)),
         }
     }
 
@@ -168,9 +156,9 @@ impl Contestant {
         side: usize,
         views: &ViewsSection,
     ) -> Result<Picture, EvalError> {
-        match (&shown.gaussians, &self.means) {
+        match (&shown.gaussians, self) {
             (Some(gaussians), _) => rendered(gaussians, camera, side, views),
-            (None, Means::Mean(pictures)) => pictures.picture(view, side),
+            (None, Self::Mean(pictures)) => pictures.picture(view, side),
             (None, _) => Err(EvalError::Message("there is nothing to render".into())),
         }
     }
@@ -179,17 +167,18 @@ impl Contestant {
 /// Aligns Gaussians (world frame) and point maps (frame of the `front` camera) with the truth, by the centres of
 /// opaque Gaussians. Returns rotation in degrees, shift of the centres' mean in cm, and scale.
 fn aligned(
-    made: &mut Made,
+    gaussians: &mut Gaussians,
+    maps: &mut [(usize, Vec<f32>)],
     metrics: &MetricsSection,
     truth: Option<&Truth>,
     front: &Camera,
 ) -> Result<[f64; 3], EvalError> {
     let truth = truth.ok_or_else(|| EvalError::Message("there is no ground truth to align with".into()))?;
-    let centres = opaque_centres(&made.gaussians, metrics.opaque, ALIGNED)?;
+    let centres = opaque_centres(gaussians, metrics.opaque, ALIGNED)?;
     let motion = icp(&centres, &thinned(&truth.points, 10 * ALIGNED), metrics.align == Align::Similarity)?;
-    made.gaussians = made.gaussians.clone().scaled(motion.scale).transformed(&motion.rigid());
+    *gaussians = gaussians.clone().scaled(motion.scale).transformed(&motion.rigid());
     let (to_world, to_front) = (front.world_to_camera.inverse(), front.world_to_camera);
-    for (_, points) in &mut made.maps {
+    for (_, points) in maps {
         // Pixels without a prediction have the point 0.
         for point in points.as_chunks_mut::<3>().0.iter_mut().filter(|point| **point != [0.0; 3]) {
             let moved = motion.apply(to_world.apply(double(*point)).as_vec3().to_array());
@@ -226,14 +215,14 @@ fn errors(
     if maps.is_empty() {
         return Ok(Vec::new());
     }
-    let Some((photographed, there)) = points(people.test(), row, inputs, item.side, side)? else {
+    let Some((photographed, there)) = points(&people.test, row, inputs, item.side, side)? else {
         return Ok(Vec::new());
     };
     let of_inputs = photographed.chunks_exact(3 * side * side).zip(there.chunks_exact(side * side));
     let mut truths: Vec<Points> =
         of_inputs.map(|(points, valid)| (points.to_vec(), valid.to_vec())).collect();
     for azimuth in SIDES {
-        truths.push(side_points(people.test(), row, item, inputs[0], azimuth, side)?);
+        truths.push(side_points(&people.test, row, item, inputs[0], azimuth, side)?);
     }
     let with_truth = maps.iter().filter_map(|(view, points)| Some((*view, points, truths.get(*view)?)));
     let pairs = with_truth.map(|(view, points, (truth, valid))| Pair { view, points, truth, valid });
@@ -249,6 +238,7 @@ mod tests {
     use snapsnap_ops::host;
 
     use super::*;
+    use crate::stability::splats::gaussians;
 
     /// Alignment undoes a known similarity that moved Gaussians and maps by less than the distance of neighbours.
     #[test]
@@ -269,40 +259,29 @@ mod tests {
         let truth = Truth { points: cloud.clone(), views: Vec::new() };
         for (align, most) in [(Align::Similarity, 1e-5), (Align::Rigid, 2e-3)] {
             let metrics = MetricsSection { align, ..MetricsSection::default() };
-            let device = Device::flex();
-            let n = moved.len();
-            let tensor =
-                |values: Vec<f32>, c: usize| Tensor::<2>::from_data(TensorData::new(values, [n, c]), &device);
-            let gaussians = Gaussians::new(
-                tensor(moved.concat(), 3),
-                tensor([1.0, 0.0, 0.0, 0.0].repeat(n), 4),
-                tensor(vec![0.01; 3 * n], 3),
-                Tensor::ones([n], &device),
-                tensor(vec![0.5; 3 * n], 3),
-            );
+            let row =
+                |[x, y, z]: &[f32; 3]| [*x, *y, *z, 1.0, 0.0, 0.0, 0.0, 0.01, 0.01, 0.01, 1.0, 0.5, 0.5, 0.5];
+            let rows = TensorData::new(moved.iter().flat_map(row).collect::<Vec<f32>>(), [moved.len(), 14]);
+            let mut gaussians = gaussians(&Tensor::from_data(rows, &Device::flex()));
             // The last pixel has no prediction.
-            let maps = vec![(1, [seen(&moved), vec![0.0; 3]].concat())];
-            let mut made = Made {
-                gaussians: gaussians.expect("valid"),
-                maps,
-                lost: 0,
-                time: Duration::ZERO,
-                modules: Vec::new(),
-                steps: Vec::new(),
-            };
-            let [degrees, _, scale] = aligned(&mut made, &metrics, Some(&truth), &front).expect("aligned");
+            let mut maps = [(1, [seen(&moved), vec![0.0; 3]].concat())];
+            let [degrees, _, scale] =
+                aligned(&mut gaussians, &mut maps, &metrics, Some(&truth), &front).expect("aligned");
             let farthest =
                 |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0_f32, f32::max);
-            let apart = farthest(&host(made.gaussians.means.clone()), &cloud.concat());
+            let apart = farthest(&host(gaussians.means.clone()), &cloud.concat());
             assert!(apart < most, "{align:?}: {apart} m");
-            let map = &made.maps[0].1;
-            assert!(farthest(map, &seen(&cloud)) < 2.0 * most && map[3 * n..] == [0.0; 3], "{align:?}");
+            let map = &maps[0].1;
+            assert!(
+                farthest(map, &seen(&cloud)) < 2.0 * most && map[3 * moved.len()..] == [0.0; 3],
+                "{align:?}"
+            );
             let expected = if align == Align::Rigid { 1.0 } else { 1.0 / 0.998 };
             let turned = turn.to_axis_angle().1.to_degrees();
             assert!((scale - expected).abs() < 1e-5 && (degrees - turned).abs() < 0.01, "{degrees}° {scale}");
-            let size = host(made.gaussians.scales.clone())[0];
+            let size = host(gaussians.scales.clone())[0];
             assert!((f64::from(size) - 0.01 * scale).abs() < 1e-6, "{size}");
-            let nothing = aligned(&mut made, &metrics, None, &front);
+            let nothing = aligned(&mut gaussians, &mut maps, &metrics, None, &front);
             assert!(nothing.is_err_and(|e| e.to_string().contains("no ground truth")));
         }
     }

@@ -51,14 +51,14 @@ pub fn evaluate_meshes(
     folder: &Path,
     progress: &dyn Fn(usize, usize),
 ) -> (Vec<MeshFigures>, Vec<LeftOut>) {
-    let total = sets.iter().map(|set| set.chosen().len()).sum();
+    let total = sets.iter().map(|set| set.chosen.len()).sum();
     let (mut figures, mut left_out) = (Vec::new(), Vec::new());
-    let people = sets.iter().flat_map(|set| set.chosen().iter().map(move |row| (set, *row)));
+    let people = sets.iter().flat_map(|set| set.chosen.iter().map(move |row| (set, *row)));
     for (done, (people, row)) in people.enumerate() {
         let name = name_of(sets, people, row);
-        let own = people.test().name(row);
+        let own = people.test.name(row);
         // A file needs the data set's name only if several data sets have a person of this name.
-        let is_in = |set: &&People| set.chosen().iter().any(|row| set.test().name(*row) == own);
+        let is_in = |set: &&People| set.chosen.iter().any(|row| set.test.name(*row) == own);
         let is_alone = sets.iter().filter(is_in).count() == 1;
         let names: Vec<&str> = [&*name].into_iter().chain(is_alone.then_some(own)).collect();
         match one(config, people, row, &names, folder) {

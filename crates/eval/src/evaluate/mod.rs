@@ -23,7 +23,7 @@ use crate::geometry::Align;
 use crate::lpips::Lpips;
 use crate::pictures::Picture;
 use crate::points::PointError;
-use crate::preview::{color, grid, heat};
+use crate::preview::{grid, heat, picture};
 use crate::region::{Region, margin};
 use crate::score::Score;
 
@@ -59,8 +59,8 @@ pub struct Judged {
     pub kind: Kind,
     /// Scores of the views.
     pub rows: Vec<Row>,
-    /// Errors of the predicted points, per person and turn.
-    pub points: Vec<(usize, Vec<PointError>)>,
+    /// Errors of the predicted points, of all people and turns.
+    pub points: Vec<PointError>,
     /// The Gaussians as a surface, per person and turn.
     pub surface: Vec<(usize, Surface)>,
     /// The mesh made of the Gaussians, per person and turn.
@@ -106,20 +106,20 @@ pub fn evaluate(
     lpips: Option<&Lpips>,
     progress: &dyn Fn(usize, usize),
 ) -> Outcome {
-    let total = sets.iter().map(|set| set.chosen().len()).sum();
+    let total = sets.iter().map(|set| set.chosen.len()).sum();
     let mut sides: Vec<String> = sets.iter().map(|set| format!("{}²", set.side(&config.views))).collect();
     sides.dedup();
     let pictures =
         format!("pictures of {} pixels, rendered at {}×", sides.join(" and "), config.views.supersampling);
     let named = |contestant: &Contestant| Judged {
-        name: contestant.name.clone(),
+        name: contestant.name().to_owned(),
         kind: contestant.kind(),
         ..Judged::default()
     };
     let judged = contestants.iter().map(named).collect();
     let mut outcome = Outcome { people: Vec::new(), judged, left_out: Vec::new(), pictures };
     for people in sets {
-        for &row in people.chosen() {
+        for &row in &people.chosen {
             let person = outcome.people.len();
             outcome.people.push(name_of(sets, people, row));
             let at = Place { config, contestants, lpips, people, row, person };
@@ -185,7 +185,7 @@ impl Place<'_> {
         let mut shown = Vec::new();
         for (i, contestant) in contestants.iter().enumerate() {
             let made = contestant.prepare(people, row, &item, &inputs, side, (&config.metrics, truth));
-            let made = self.kept(outcome, &format!(", {}", contestant.name), made);
+            let made = self.kept(outcome, &format!(", {}", contestant.name()), made);
             if let Some(made) = &made {
                 self.measure(i, made, truth, outcome);
             }
@@ -213,7 +213,7 @@ impl Place<'_> {
             let degrees = person::degrees(&item.cameras[view], &item.cameras[inputs[0]]);
             let scored = self.kept(outcome, &format!(", view {view}"), found);
             for (i, scores) in scored.unwrap_or_default() {
-                let what = format!(", {}, view {view}", contestants[i].name);
+                let what = format!(", {}, view {view}", contestants[i].name());
                 if let Some(scores) = self.kept(outcome, &what, scores) {
                     outcome.judged[i].rows.push(Row { person, turn, view, degrees, scores });
                 }
@@ -224,14 +224,14 @@ impl Place<'_> {
     /// Records all measurements of a contestant except the scores of pictures.
     fn measure(&self, i: usize, made: &Shown, truth: Option<&Truth>, outcome: &mut Outcome) {
         let Self { config, person, .. } = *self;
-        let name = format!(", {}", self.contestants[i].name);
+        let name = format!(", {}", self.contestants[i].name());
         let points = self.kept(outcome, &format!("{name}, points"), made.points.clone());
         if made.lost > 0 {
             let why = format!("{} pixels or Gaussians left out: they are not finite", made.lost);
             self.left_out(outcome, &name, why);
         }
         let judged = &mut outcome.judged[i];
-        judged.points.extend(points.filter(|points| !points.is_empty()).map(|points| (person, points)));
+        judged.points.extend(points.into_iter().flatten());
         judged.times.extend(made.time);
         judged.gaussians.extend(made.gaussians.as_ref().map(Gaussians::len));
         judged.aligned.extend(made.aligned);
@@ -285,7 +285,7 @@ pub fn sheet(
     persons: &[usize],
 ) -> (Option<RgbImage>, Vec<LeftOut>) {
     let places: Vec<(&People, usize)> =
-        sets.iter().flat_map(|set| set.chosen().iter().map(move |row| (set, *row))).collect();
+        sets.iter().flat_map(|set| set.chosen.iter().map(move |row| (set, *row))).collect();
     let (mut rows, mut left_out) = (Vec::new(), Vec::new());
     for (people, row) in persons.iter().map(|person| places[*person]) {
         match pictures(config, people, row, contestant) {
@@ -293,12 +293,9 @@ pub fn sheet(
             Err(e) => left_out.push(LeftOut::new(format!("{}, pictures", name_of(sets, people, row)), e)),
         }
     }
-    let degrees = config
-        .report
-        .degrees
-        .iter()
-        .flat_map(|degrees| [format!("{degrees} deg. render"), "truth".into(), "error".into()]);
-    let captions: Vec<String> = ["front".into(), "back".into()].into_iter().chain(degrees).collect();
+    let of_view = |degrees: &f64| [format!("{degrees} deg. render"), "truth".into(), "error".into()];
+    let views = config.report.degrees.iter().flat_map(of_view);
+    let captions: Vec<String> = ["front".into(), "back".into()].into_iter().chain(views).collect();
     let captions: Vec<&str> = captions.iter().map(String::as_str).collect();
     (grid(&rows, &captions, &format!("white errors: {WORST} of 1 or more")), left_out)
 }
@@ -326,10 +323,9 @@ fn pictures(
         let (target, _) = people.target(row, view, side)?;
         let window = Region::paper(&target)?.window;
         let [image, target] = [image, target].map(|picture| picture.cropped(window));
-        let error = RgbImage::from_fn(image.width as u32, image.height as u32, |x, y| {
-            let i = y as usize * image.width + x as usize;
+        let error = picture([image.width, image.height], |i| {
             let apart = |c: usize| (image.plane(c)[i] - target.plane(c)[i]).abs();
-            color(heat((apart(0) + apart(1) + apart(2)) / 3.0, WORST))
+            heat((apart(0) + apart(1) + apart(2)) / 3.0, WORST)
         });
         pictures.extend([image.to_rgb8(), target.to_rgb8(), error]);
     }

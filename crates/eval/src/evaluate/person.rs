@@ -22,10 +22,12 @@ use crate::pictures::Picture;
 
 /// The people of one data set.
 pub struct People {
-    test: Test,
-    folder: Arc<Folder>,
-    /// Rows of `test`.
-    chosen: Vec<usize>,
+    /// The data set's people.
+    pub test: Test,
+    /// The data set.
+    pub folder: Arc<Folder>,
+    /// Rows of `test` that are evaluated.
+    pub chosen: Vec<usize>,
 }
 
 impl People {
@@ -64,21 +66,6 @@ impl People {
         Ok(Self { test, folder, chosen })
     }
 
-    /// The data set.
-    pub fn folder(&self) -> &Folder {
-        &self.folder
-    }
-
-    /// Its people.
-    pub fn test(&self) -> &Test {
-        &self.test
-    }
-
-    /// Rows of the people that are evaluated.
-    pub fn chosen(&self) -> &[usize] {
-        &self.chosen
-    }
-
     /// Views of each person.
     pub fn views(&self) -> usize {
         self.folder.description().views
@@ -108,14 +95,12 @@ impl People {
     ) -> Result<TestItem, EvalError> {
         let item = self.test.sample(row, inputs, changes)?;
         let mirrors = |camera: &Camera| camera.world_to_camera.rotation.determinant() < 0.0;
-        match item.cameras.iter().position(mirrors) {
-            None => Ok(item),
-            Some(view) => {
-                let name = self.test.name(row);
-                let message = format!("{name}: the camera of view {view} is a reflection, no rotation");
-                Err(EvalError::File(FileError::unsuitable(self.folder.root(), message)))
-            }
+        if let Some(view) = item.cameras.iter().position(mirrors) {
+            let name = self.test.name(row);
+            let message = format!("{name}: the camera of view {view} is a reflection, no rotation");
+            return Err(EvalError::File(FileError::unsuitable(self.folder.root(), message)));
         }
+        Ok(item)
     }
 
     /// The ground-truth picture of a view over black, and the person's share of each pixel `[S, S]`.

@@ -28,12 +28,12 @@ impl LeftOut {
 /// The people whom the config names and no data set has.
 pub(super) fn missing(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
     let is_missing = |name: &&String| {
-        !sets.iter().any(|set| set.chosen().iter().any(|row| set.test().name(*row) == name.as_str()))
+        !sets.iter().any(|set| set.chosen.iter().any(|row| set.test.name(*row) == name.as_str()))
     };
     let missing = config.data.only.iter().filter(is_missing);
     let why = "data.only: no data set has this person, or not among its first `data.subjects`";
     let mut left_out: Vec<LeftOut> = missing.map(|name| LeftOut::new(name, why)).collect();
-    if left_out.is_empty() && sets.iter().all(|set| set.chosen().is_empty()) {
+    if left_out.is_empty() && sets.iter().all(|set| set.chosen.is_empty()) {
         left_out.push(LeftOut::new("everything", "the data sets have no people"));
     }
     left_out
@@ -41,12 +41,12 @@ pub(super) fn missing(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
 
 /// A person's name. With several data sets, the data set's name stands before it.
 pub(super) fn name_of(sets: &[People], people: &People, row: usize) -> String {
-    let name = people.test().name(row);
+    let name = people.test.name(row);
     if sets.len() < 2 {
         return name.to_owned();
     }
     let parts = |set: &People| {
-        let root = set.folder().root();
+        let root = set.folder.root();
         let root = root.canonicalize().unwrap_or_else(|_| root.to_owned());
         let parts = root.components().filter(|part| matches!(part, Component::Normal(_)));
         parts.map(|part| part.as_os_str().to_string_lossy().into_owned()).collect::<Vec<_>>()

@@ -66,10 +66,10 @@ pub struct Truth {
 /// # Errors
 /// [`EvalError`] for files that cannot be read, or if no view has a point.
 pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
-    let cameras = people.test().sample(row, &[], &PhotographChanges::default())?.cameras;
+    let cameras = people.test.sample(row, &[], &PhotographChanges::default())?.cameras;
     let directions = DIRECTIONS.map(|wanted| nearest_view(&cameras, 0, wanted));
     let of_view = |(view, camera): (usize, &Camera)| {
-        let (points, valid) = people.test().points(row, &[view])?;
+        let (points, valid) = people.test.points(row, &[view])?;
         let to_world = camera.world_to_camera.inverse();
         let there: Vec<usize> = (0..valid.len()).filter(|i| valid[*i] > 0.5).collect();
         let in_world = |i| to_world.apply(double(points.as_chunks().0[i])).as_vec3().to_array();
@@ -88,7 +88,7 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
     };
     let numbered: Vec<(usize, &Camera)> = cameras.iter().enumerate().collect();
     let mut found = Vec::new();
-    for views in numbered.chunks(at_once(people.folder().description().resolution as usize)) {
+    for views in numbered.chunks(at_once(people.folder.description().resolution as usize)) {
         let part: Result<Vec<_>, EvalError> = views.par_iter().map(|view| of_view(*view)).collect();
         found.extend(part?);
     }

@@ -84,22 +84,23 @@ impl Found {
 }
 
 /// The largest error, ∞ if one is NaN.
-fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
+pub fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
     let number = |error: f64| if error.is_nan() { f64::INFINITY } else { error };
     errors.into_iter().map(number).fold(0.0, f64::max)
 }
 
 /// The difference of a value from its f64 reference.
-fn apart(found: f32, expected: f64) -> f64 {
+pub fn apart(found: f32, expected: f64) -> f64 {
     (f64::from(found) - expected).abs()
 }
 
 /// A tracked tensor.
-fn tracked<const D: usize>(values: Vec<f32>, shape: [usize; D], device: &Device) -> Tensor<D> {
+pub fn tracked<const D: usize>(values: Vec<f32>, shape: [usize; D], device: &Device) -> Tensor<D> {
     Tensor::from_data(TensorData::new(values, shape), &device.clone().autodiff()).require_grad()
 }
 
-fn all_finite(values: &[f32]) -> bool {
+/// Whether no value is infinite or NaN.
+pub fn all_finite(values: &[f32]) -> bool {
     values.iter().all(|v| v.is_finite())
 }
 

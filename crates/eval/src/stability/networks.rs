@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use snapsnap_net::config::{Anchor, ConfMode, NetworkConfig};
 use snapsnap_net::network::activate;
 use snapsnap_net::precision::Precision;
-use snapsnap_net::regressor::{Attributes, Regressor, Statistics};
+use snapsnap_net::regressor::{Attributes, Regressor};
 use snapsnap_net::weights::{WeightFile, WeightsError};
 use snapsnap_net::{Photograph, Reconstructor};
 use snapsnap_ops::{Rope, host, rotary_attention};
@@ -236,7 +236,7 @@ fn constant_channels(device: &Device) -> Found {
         (0..6).flat_map(|c| vec![[0.5, -1.0, 0.25, 0.0, 2.0, 1e3][c]; side * side]).collect();
     let x = tracked(values, [1, 6, side, side], device);
     let network = burn::module::Module::fork(network, &device.clone().autodiff());
-    let features = network.forward(x.clone(), &mut Statistics::measured());
+    let features = network.forward(x.clone());
     let gradient = gradient_of_sum(&features, &x);
     let got = host(features.cast(DType::F32));
     let width = got.len() / (side * side);

@@ -59,11 +59,6 @@ impl Pieces {
     pub fn body(&self) -> Option<usize> {
         (0..self.sizes.len()).filter(|piece| self.inside[*piece]).max_by_key(|piece| self.sizes[*piece])
     }
-
-    /// Number of pieces inside.
-    pub fn bodies(&self) -> usize {
-        self.inside.iter().filter(|inside| **inside).count()
-    }
 }
 
 impl Grid {
@@ -140,8 +135,8 @@ impl Grid {
         }
         let mut pieces = self.pieces();
         let Some(body) = pieces.body() else { return Kept::default() };
-        let dropped = pieces.bodies() - 1;
         let others = (0..pieces.sizes.len()).filter(|i| pieces.inside[*i] && *i != body);
+        let dropped = others.clone().count();
         let largest = others.map(|i| pieces.sizes[i]).max().unwrap_or(0);
         let largest_dropped = largest as f64 / pieces.sizes[body] as f64;
         if dropped > 0 {

@@ -10,8 +10,6 @@ use super::grid::{Grid, STEPS};
 
 /// Width of the widest closed tunnel in cubes, 5 cm for a person of 1.7 m.
 const WIDEST: f32 = 8.0;
-/// Thickness that is added to each side of a wall, in cubes.
-const THICKER: usize = 1;
 
 /// The 14 corners that share an edge with a corner: their offsets, and bit sets of their neighbours among the 14. The
 /// edges are the edges of Kuhn's subdivision, in which corners that are neighbours in pairs form a simplex.
@@ -75,17 +73,13 @@ impl Grid {
             }
         }
 
-        // Walls of one cube would be lost when the surface is reduced.
-        let mut front: Vec<usize> = added.iter().copied().filter(|row| kept[*row]).collect();
-        for _ in 0..THICKER {
-            let around: Vec<usize> = front.iter().flat_map(|row| near(*row)).collect();
-            front.clear();
-            for row in around.into_iter().filter(|row| is_added(*row)) {
-                let bits = link(&kept, row);
-                if !kept[row] && CONNECTED[usize::from(bits)] && CONNECTED[usize::from(!bits & all)] {
-                    kept[row] = true;
-                    front.push(row);
-                }
+        // Walls of one cube would be lost when the surface is reduced. Each side gets one more cube.
+        let walls = added.iter().filter(|row| kept[**row]);
+        let around: Vec<usize> = walls.flat_map(|row| near(*row)).collect();
+        for row in around.into_iter().filter(|row| is_added(*row)) {
+            let bits = link(&kept, row);
+            if CONNECTED[usize::from(bits)] && CONNECTED[usize::from(!bits & all)] {
+                kept[row] = true;
             }
         }
         for row in added.into_iter().filter(|row| kept[*row]) {

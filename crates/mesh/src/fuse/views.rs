@@ -4,7 +4,7 @@ use burn::tensor::Tensor;
 use glam::{DAffine3, DMat3, DMat4, DVec2, DVec3, Mat4, Vec3};
 use rayon::prelude::*;
 use snapsnap_splat::scene::Loaded;
-use snapsnap_splat::{Camera, RenderOptions, RigidTransform, SplatError, render};
+use snapsnap_splat::{Camera, Orbit, RenderOptions, RigidTransform, SplatError, render};
 
 /// Rings of cameras around the subject: downward pitch in degrees, and number of cameras.
 const RINGS: [(f64, usize); 7] =
@@ -39,22 +39,12 @@ pub struct View {
 pub fn cameras(radius: f64, side: u32) -> Vec<Camera> {
     let distance = DISTANCE * radius;
     let focal = (distance * distance / (radius * radius) - 1.0).sqrt() * 0.5 * 0.98;
-    let ring = |(row, (pitch, count)): (usize, (f64, usize))| {
+    let orbit = Orbit { centre: DVec3::ZERO, radius: distance, focal, ..Orbit::default() };
+    let ring = |(row, (pitch_degrees, count)): (usize, (f64, usize))| {
         (0..count).map(move |i| {
-            let yaw = (360.0 * (i as f64 + 0.5 * (row % 2) as f64) / count as f64).to_radians();
-            let pitch: f64 = pitch.to_radians();
-            let backward = DVec3::new(pitch.cos() * yaw.sin(), pitch.sin(), pitch.cos() * yaw.cos());
-            let right = DVec3::new(yaw.cos(), 0.0, -yaw.sin());
-            let forward = -backward;
-            let rotation = DMat3::from_cols(right, forward.cross(right), forward).transpose();
-            let translation = -(rotation * (distance * backward));
-            Camera {
-                width: side,
-                height: side,
-                focal: DVec2::splat(focal * f64::from(side)),
-                principal_point: DVec2::splat(0.5 * f64::from(side)),
-                world_to_camera: RigidTransform { rotation, translation },
-            }
+            let yaw_degrees = 360.0 * (i as f64 + 0.5 * (row % 2) as f64) / count as f64;
+            let camera = Orbit { yaw_degrees, pitch_degrees, ..orbit }.camera(side);
+            Camera { principal_point: DVec2::splat(0.5 * f64::from(side)), ..camera }
         })
     };
     RINGS.into_iter().enumerate().flat_map(ring).collect()

@@ -1,4 +1,4 @@
-//! Reads binary glTF 2.0: all triangles of the default scene with their base colours, transformed by nodes or skins.
+//! Reads binary glTF 2.0: the triangles of the default scene with base colours, moved by nodes or skins, and its bones.
 
 use std::collections::HashSet;
 use std::fmt::Display;
@@ -13,7 +13,6 @@ use gltf::{Accessor, Document, Node, Primitive, image::Source};
 use image::RgbImage;
 use snapsnap_base::{FileError, file};
 
-use super::rigged::{Bone, File, Place, Rigged, Skins};
 use super::skin::moved;
 use super::{MAX_BYTES, Textures, add_colors};
 use crate::mesh::{Face, Material, Mesh};
@@ -25,8 +24,64 @@ const MAX_DEPTH: usize = 256;
 /// Largest number of positions and face corners that repeated uses of the same data may add.
 const MAX_ELEMENTS: usize = 4_000_000;
 
-pub fn read(path: &Path) -> Result<Mesh, FileError> {
-    Ok(read_rigged(path)?.mesh)
+/// Number of bones that may move a position.
+pub const BONES: usize = 4;
+
+/// Bones that move a position, with shares that add up to 1.
+pub type Weights = [(u32, f32); BONES];
+
+/// A node of the skeleton in the pose of the file.
+#[derive(Debug, Clone)]
+pub struct Bone {
+    /// Name; empty if the file has none.
+    pub name: String,
+    /// Index of the parent, which precedes the bone.
+    pub parent: Option<usize>,
+    /// Origin in the space of the mesh's positions.
+    pub place: Vec3,
+}
+
+/// A mesh with its skeleton and skin weights.
+#[derive(Debug, Clone, Default)]
+pub struct Rigged {
+    /// The mesh in the pose of the file's nodes.
+    pub mesh: Mesh,
+    /// All nodes of the scene, parents before children.
+    pub bones: Vec<Bone>,
+    /// By position: skin weights. A mesh without a skin follows its node. Empty if the file has no skin.
+    pub weights: Vec<Weights>,
+    /// Whether the file has morph targets or animations, which are ignored.
+    pub has_animations: bool,
+}
+
+/// By skin and joint: index of the bone, and the matrix from the mesh's space to the world.
+pub type Skins = Vec<Vec<(u32, Mat4)>>;
+
+/// A primitive at a node.
+pub struct Place {
+    pub mesh: usize,
+    pub primitive: usize,
+    /// Index of the node in [`Rigged::bones`].
+    pub node: usize,
+    pub skin: Option<usize>,
+}
+
+pub struct File<'a> {
+    pub path: &'a Path,
+    /// The binary chunk.
+    pub blob: Vec<u8>,
+    pub rigged: Rigged,
+    /// By the index of the image.
+    pub(super) textures: Textures<usize>,
+    /// Number of nodes that may still be visited. A tree has each node once, but a damaged file may contain loops.
+    pub nodes_left: usize,
+    pub places: Vec<Place>,
+    /// Accessors of positions and indices that an entry of `places` uses.
+    pub shown: HashSet<usize>,
+    /// Positions and corners that second and further uses of an accessor add.
+    pub elements: usize,
+    /// By bone: index of the node, and the node's transform to the world.
+    pub worlds: Vec<(usize, Mat4)>,
 }
 
 pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
@@ -41,20 +96,18 @@ pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
     let mut file = File {
         path,
         blob: blob.unwrap_or_default(),
-        mesh: Mesh::default(),
+        rigged: Rigged::default(),
         textures: Textures::new(),
         nodes_left: document.nodes().len(),
         places: Vec::new(),
         shown: HashSet::new(),
         elements: 0,
-        bones: Vec::new(),
         worlds: Vec::new(),
-        weights: Vec::new(),
     };
     file.add(&document)?;
     let has_targets = document.meshes().flat_map(|m| m.primitives()).any(|p| p.morph_targets().len() > 0);
-    let has_animations = has_targets || document.animations().len() > 0;
-    Ok(Rigged { mesh: file.mesh, bones: file.bones, weights: file.weights, has_animations })
+    file.rigged.has_animations = has_targets || document.animations().len() > 0;
+    Ok(file.rigged)
 }
 
 /// Refuses missing and out-of-range references, on which the validation of the `gltf` crate would panic.
@@ -80,10 +133,10 @@ impl File<'_> {
     fn add(&mut self, document: &Document) -> Result<(), FileError> {
         for material in document.materials() {
             let material = self.material(&material)?;
-            self.mesh.materials.push(material);
+            self.rigged.mesh.materials.push(material);
         }
         // Primitives without a material are white.
-        self.mesh.materials.push(Material::default());
+        self.rigged.mesh.materials.push(Material::default());
         let scene = document.default_scene().or_else(|| document.scenes().next());
         let scene = scene.ok_or_else(|| self.wrong("it has no scene"))?;
         for node in scene.nodes() {
@@ -125,9 +178,9 @@ impl File<'_> {
         self.nodes_left -= 1;
         let from = parent.map_or(Mat4::IDENTITY, |row| self.worlds[row].1);
         let to_world = from * Mat4::from_cols_array_2d(&node.transform().matrix());
-        let own = self.bones.len();
+        let own = self.rigged.bones.len();
         let name = node.name().unwrap_or_default().to_owned();
-        self.bones.push(Bone { name, parent, place: to_world.transform_point3(Vec3::ZERO) });
+        self.rigged.bones.push(Bone { name, parent, place: to_world.transform_point3(Vec3::ZERO) });
         self.worlds.push((node.index(), to_world));
         if let Some(mesh) = node.mesh() {
             for (row, primitive) in mesh.primitives().enumerate() {
@@ -197,10 +250,11 @@ impl File<'_> {
                 return Err(self.wrong(format!("a primitive has {found} {what} for {count} positions")));
             }
         }
-        let first = self.mesh.positions.len() as u32;
-        let first_texcoord = self.mesh.texcoords.len() as u32;
+        let mesh = &mut self.rigged.mesh;
+        let first = mesh.positions.len() as u32;
+        let first_texcoord = mesh.texcoords.len() as u32;
         let rows = indices.unwrap_or_else(|| (0..positions.len() as u32).collect());
-        let material = primitive.material().index().unwrap_or(self.mesh.materials.len() - 1) as u32;
+        let material = primitive.material().index().unwrap_or(mesh.materials.len() - 1) as u32;
         // A node that mirrors turns its triangles inside out.
         let mirrored = to_world.determinant() < 0.0;
         let triangles = rows.len().saturating_sub(2);
@@ -218,16 +272,16 @@ impl File<'_> {
             if mirrored {
                 (b, c) = (c, b);
             }
-            self.mesh.faces.push(Face {
+            mesh.faces.push(Face {
                 positions: [a, b, c].map(|row| row + first),
                 texcoords: (!texcoords.is_empty()).then(|| [a, b, c].map(|row| row + first_texcoord)),
                 material,
             });
         }
-        self.mesh.positions.extend(positions);
-        self.weights.extend(weights);
-        self.mesh.texcoords.extend(texcoords);
-        add_colors(&mut self.mesh, first as usize, colors.into_iter());
+        mesh.positions.extend(positions);
+        mesh.texcoords.extend(texcoords);
+        add_colors(mesh, first as usize, colors.into_iter());
+        self.rigged.weights.extend(weights);
         Ok(())
     }
 
@@ -246,6 +300,47 @@ impl File<'_> {
         self.check("colours", colors, shares, &[Dimensions::Vec3, Dimensions::Vec4])?;
         let rows = [DataType::U8, DataType::U16, DataType::U32];
         self.check("indices", primitive.indices(), &rows, &[Dimensions::Scalar])
+    }
+
+    pub fn wrong(&self, problem: impl ToString) -> FileError {
+        FileError::unsuitable(self.path, problem)
+    }
+
+    /// Refuses an accessor of a wrong type or beyond the file. The reader of the `gltf` crate checks neither.
+    pub fn check(
+        &self,
+        name: &str,
+        accessor: Option<Accessor>,
+        types: &[DataType],
+        dimensions: &[Dimensions],
+    ) -> Result<(), FileError> {
+        let Some(accessor) = accessor else { return Ok(()) };
+        let index = accessor.index();
+        if !types.contains(&accessor.data_type()) || !dimensions.contains(&accessor.dimensions()) {
+            let found = format!("{:?} of {:?}", accessor.dimensions(), accessor.data_type());
+            return Err(self.wrong(format!("accessor {index} holds {name}, but as {found}")));
+        }
+        if accessor.sparse().is_some() {
+            return Err(self.wrong(format!("accessor {index} is sparse, which scans are not")));
+        }
+        let view = accessor.view().ok_or_else(|| self.wrong(format!("accessor {index} has no data")))?;
+        let size = accessor.size();
+        let stride = view.stride().unwrap_or(size);
+        let end = accessor
+            .count()
+            .checked_sub(1)
+            .and_then(|last| last.checked_mul(stride)?.checked_add(size)?.checked_add(accessor.offset()));
+        let inside = view.offset().checked_add(view.length()).is_some_and(|end| end <= self.blob.len());
+        if stride < size || !inside || end.is_none_or(|end| end > view.length()) {
+            let count = accessor.count();
+            return Err(self.wrong(format!(
+                "accessor {index} promises {count} entries, more than the file holds; it may be cut off"
+            )));
+        }
+        if view.buffer().index() != 0 {
+            return Err(self.wrong(format!("accessor {index} lies outside the file")));
+        }
+        Ok(())
     }
 }
 

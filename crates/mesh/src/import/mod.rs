@@ -3,7 +3,6 @@
 mod glb;
 mod obj;
 mod ply;
-mod rigged;
 mod skin;
 #[cfg(test)]
 mod tests;
@@ -19,7 +18,7 @@ use snapsnap_base::{FileError, guarded, quoted};
 
 use crate::mesh::Mesh;
 use crate::picture::decode;
-pub use rigged::{Bone, Rigged, Weights};
+pub use glb::{Bone, Rigged, Weights};
 
 /// File extensions that [`read`] accepts, in lower case.
 pub const EXTENSIONS: [&str; 3] = ["obj", "ply", "glb"];
@@ -40,10 +39,10 @@ const MAX_TEXTURES: u64 = 1 << 30;
 /// cannot be drawn: no triangle, NaN, references out of range.
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
-    let reader = match extension.as_str() {
+    let reader: fn(&Path) -> Result<Mesh, FileError> = match extension.as_str() {
         "obj" => obj::read,
         "ply" => ply::read,
-        "glb" => glb::read,
+        "glb" => |path| Ok(glb::read_rigged(path)?.mesh),
         _ => return Err(FileError::unsuitable(path, "is no scan: expected a file .obj, .ply or .glb")),
     };
     let mut mesh = guarded(path, || reader(path))?;

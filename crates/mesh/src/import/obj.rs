@@ -69,13 +69,12 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         mesh.texcoords.extend(model.texcoords.chunks_exact(2).map(Vec2::from_slice));
         let colors = model.vertex_color.chunks_exact(3).map(Vec3::from_slice);
         add_colors(&mut mesh, first as usize, colors);
-        let corner = |rows: &[u32], first: u32| [rows[0] + first, rows[1] + first, rows[2] + first];
         let material = model.material_id.map_or(0, |id| id as u32 + 1);
-        for (index, rows) in model.indices.chunks_exact(3).enumerate() {
-            let texcoords = model.texcoord_indices.get(3 * index..3 * index + 3);
+        let mut texcoords = model.texcoord_indices.as_chunks::<3>().0.iter();
+        for rows in model.indices.as_chunks::<3>().0 {
             mesh.faces.push(Face {
-                positions: corner(rows, first),
-                texcoords: texcoords.map(|rows| corner(rows, first_texcoord)),
+                positions: rows.map(|row| row + first),
+                texcoords: texcoords.next().map(|rows| rows.map(|row| row + first_texcoord)),
                 material,
             });
         }

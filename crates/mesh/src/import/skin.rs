@@ -7,7 +7,7 @@ use gltf::accessor::{DataType, Dimensions};
 use gltf::{Document, Primitive, Semantic};
 use snapsnap_base::FileError;
 
-use super::rigged::{BONES, File, Skins, Weights};
+use super::glb::{BONES, File, Skins, Weights};
 
 /// Largest deviation of the sum of a position's weights from 1.
 const LARGEST_ERROR: f32 = 0.02;

@@ -27,7 +27,7 @@ pub fn size(bytes: &[u8]) -> Result<([u32; 2], u64), ImageError> {
     let info = heic_decoder::probe(bytes).map_err(damaged)?;
     let side = |length: usize| u32::try_from(length).map_err(damaged);
     let mut pixels = (info.coded_width as u64).saturating_mul(info.coded_height as u64);
-    if contains(bytes, b"grid") {
+    if places(bytes, b"grid").next().is_some() {
         // Tiles may be larger than the picture, which is cropped from them. Each tile is one item of the file.
         let items = places(bytes, b"hvc1").count() as u64;
         let largest = places(bytes, b"hvcC").filter_map(|at| coded_pixels(&bytes[at + 4..])).max();
@@ -42,10 +42,6 @@ pub fn size(bytes: &[u8]) -> Result<([u32; 2], u64), ImageError> {
 
 fn places<'a>(bytes: &'a [u8], kind: &'a [u8; 4]) -> impl Iterator<Item = usize> + 'a {
     bytes.windows(4).enumerate().filter(move |(_, found)| *found == kind).map(|(at, _)| at)
-}
-
-fn contains(bytes: &[u8], kind: &[u8; 4]) -> bool {
-    places(bytes, kind).next().is_some()
 }
 
 /// Coded pixels, from the sequence parameter set of a configuration (ISO/IEC 14496-15, 8.3.2.1; H.265, 7.3.2.2).

@@ -64,8 +64,10 @@ impl<'a> Jpeg<'a> {
 /// count.
 fn is_whole(bytes: &[u8]) -> bool {
     let mut at = 0;
-    // A marker follows 0xFF and optional padding. The length of the segment follows most markers.
-    while let Some(found) = bytes[at..].windows(2).position(|pair| pair[0] == 0xff && is_marker(pair[1])) {
+    // A marker follows 0xFF and optional padding with 0xFF. 0 after 0xFF means coded data.
+    let is_marker = |pair: &[u8]| pair[0] == 0xff && pair[1] != 0 && pair[1] != 0xff;
+    // The length of the segment follows most markers.
+    while let Some(found) = bytes[at..].windows(2).position(is_marker) {
         let marker = bytes[at + found + 1];
         at += found + 2;
         match marker {
@@ -82,9 +84,4 @@ fn is_whole(bytes: &[u8]) -> bool {
         }
     }
     false
-}
-
-/// Whether the byte after 0xFF is a marker. 0 means coded data, 0xFF means padding.
-fn is_marker(byte: u8) -> bool {
-    byte != 0 && byte != 0xff
 }

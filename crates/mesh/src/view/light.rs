@@ -89,13 +89,10 @@ fn directions(count: usize) -> impl Iterator<Item = Vec3> {
 }
 
 /// The directions from which light is summed. The second half are the opposites of the first, in the same order.
-pub fn ways() -> [Vec3; WAYS] {
-    let mut ways = [Vec3::ZERO; WAYS];
+pub fn ways() -> Vec<Vec3> {
     // The upper hemisphere of an even distribution.
-    for (i, way) in directions(WAYS).take(PAIRS).enumerate() {
-        (ways[i], ways[i + PAIRS]) = (way, -way);
-    }
-    ways
+    let upper = || directions(WAYS).take(PAIRS);
+    upper().chain(upper().map(|way| -way)).collect()
 }
 
 /// A distant area light.

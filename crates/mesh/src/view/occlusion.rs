@@ -58,7 +58,7 @@ impl Places {
 
 /// Directions that are visible from the surfaces of a mesh.
 pub struct Occlusion {
-    ways: [Vec3; WAYS],
+    ways: Vec<Vec3>,
     places: Places,
     /// By place. A direction in front of the surface is seen from its front, a direction behind it from its back.
     seen: Vec<Seen>,

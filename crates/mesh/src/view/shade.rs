@@ -6,8 +6,8 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 use image::RgbImage;
 use snapsnap_splat::Camera;
 
+use super::Renderer;
 use super::light::Lights;
-use crate::mesh::Mesh;
 
 /// Step in pixels for the derivative of texture coordinates.
 const STEP: f64 = 0.01;
@@ -80,10 +80,7 @@ pub enum Lit<'a> {
 
 /// Colours of a mesh's surfaces in the view of one camera.
 pub struct Shader<'a> {
-    pub mesh: &'a Mesh,
-    pub normals: &'a [Vec3],
-    /// One per material.
-    pub textures: &'a [Option<Arc<Pyramid>>],
+    pub renderer: &'a Renderer<'a>,
     pub camera: &'a Camera,
     /// Positions in the camera's frame.
     pub corners: &'a [DVec3],
@@ -93,7 +90,7 @@ pub struct Shader<'a> {
 impl Shader<'_> {
     /// Colour of `face` at pixel coordinates `at`; `plane` gives 1/z there.
     pub fn color(&self, face: usize, at: DVec2, plane: DVec3) -> Vec3 {
-        let Self { mesh, normals, textures, .. } = self;
+        let Renderer { mesh, normals, textures, .. } = self.renderer;
         let face = &mesh.faces[face];
         let weights = self.weights(face.positions, at, plane).as_vec3();
         let mix = |values: [Vec3; 3]| values[0] * weights.x + values[1] * weights.y + values[2] * weights.z;

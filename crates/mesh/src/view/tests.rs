@@ -32,6 +32,20 @@ fn mesh(positions: Vec<Vec3>, faces: &[[u32; 3]]) -> Mesh {
     Mesh::colored(positions, Vec::new(), faces.to_vec())
 }
 
+/// Two triangles in each of `n`² cells between the rows of (n + 1)² points.
+fn cells(n: u32) -> Vec<[u32; 3]> {
+    let firsts = (0..n).flat_map(|row| (0..n).map(move |column| row * (n + 1) + column));
+    firsts.flat_map(|a| [[a, a + 1, a + n + 2], [a, a + n + 2, a + n + 1]]).collect()
+}
+
+/// The mesh `one` with the faces of `other`, both of one material.
+fn joined(mut one: Mesh, other: &Mesh) -> Mesh {
+    let first = one.positions.len() as u32;
+    one.positions.extend(&other.positions);
+    one.faces.extend(other.faces.iter().map(|f| Face { positions: f.positions.map(|r| r + first), ..*f }));
+    one
+}
+
 /// A sphere from an octahedron, every edge halved `levels` times.
 fn sphere(centre: Vec3, radius: f32, levels: usize) -> Mesh {
     let mut triangles: Vec<[Vec3; 3]> = Vec::new();
@@ -174,14 +188,7 @@ fn neighbouring_triangles_share_no_sample_and_leave_none_out() {
             positions.push(at * z);
         }
     }
-    let mut faces = Vec::new();
-    for y in 0..n {
-        for x in 0..n {
-            let [a, b, c, d] =
-                [y * (n + 1) + x, y * (n + 1) + x + 1, (y + 1) * (n + 1) + x + 1, (y + 1) * (n + 1) + x];
-            faces.extend([[a, b, c], [a, c, d]]);
-        }
-    }
+    let faces = cells(n);
     let whole = draw(&mesh(positions.clone(), &faces), &camera, &flat(3));
     let mut sum = vec![0.0; whole.alpha.len()];
     for part in 0..5 {
@@ -309,15 +316,8 @@ fn ball_over_a_floor() -> Mesh {
     let at = |i: u32| 2.0 * i as f32 / side as f32 - 1.0;
     let rows = 0..=side;
     let positions: Vec<Vec3> =
-        rows.clone().flat_map(|z| rows.clone().map(move |x| Vec3::new(at(x), 0.0, at(z)))).collect();
-    let cells = (0..side).flat_map(|z| (0..side).map(move |x| z * (side + 1) + x));
-    let triangles = cells.flat_map(|a| [[a, a + side + 1, a + 1], [a + 1, a + side + 1, a + side + 2]]);
-    let mut mesh = Mesh::colored(positions, Vec::new(), triangles.collect());
-    let ball = sphere(Vec3::new(0.0, 0.6, 0.0), 0.3, 4);
-    let first = mesh.positions.len() as u32;
-    mesh.positions.extend(&ball.positions);
-    mesh.faces.extend(ball.faces.iter().map(|f| Face { positions: f.positions.map(|r| r + first), ..*f }));
-    mesh
+        rows.clone().flat_map(|x| rows.clone().map(move |z| Vec3::new(at(x), 0.0, at(z)))).collect();
+    joined(mesh(positions, &cells(side)), &sphere(Vec3::new(0.0, 0.6, 0.0), 0.3, 4))
 }
 
 #[test]
@@ -371,10 +371,7 @@ fn a_ball_alone_has_the_light_of_its_normals_with_the_given_contrast() {
 #[test]
 fn the_second_surface_is_the_next_that_faces_the_camera_behind_the_first_body() {
     let (near, far) = (sphere(Vec3::new(0.0, 0.0, 2.0), 0.2, 4), sphere(Vec3::new(0.05, 0.0, 3.0), 0.5, 4));
-    let mut mesh = near.clone();
-    let first = mesh.positions.len() as u32;
-    mesh.positions.extend(&far.positions);
-    mesh.faces.extend(far.faces.iter().map(|f| Face { positions: f.positions.map(|r| r + first), ..*f }));
+    let mesh = joined(near.clone(), &far);
     let camera = camera(64, 64);
     let options = ViewOptions { second: true, ..flat(1) };
     let [both, near, far] = [&mesh, &near, &far].map(|mesh| draw(mesh, &camera, &options));

@@ -88,10 +88,12 @@ impl Config {
         let is_oblique = n.pair_degrees != OPPOSITE;
         let is_geometric = r.start() == RegressorStart::Geometric;
         let hook = n.hooks.into_iter().find(|hook| *hook > n.dec_depth).unwrap_or(0);
-        let per_head = |dim: usize, heads: usize| {
+        let heads =
+            [("network.enc_heads", n.enc_dim, n.enc_heads), ("network.dec_heads", n.dec_dim, n.dec_heads)];
+        let heads = heads.map(|(key, dim, heads)| {
             let rule = "the channels of one head must be a multiple of 4 (rotary position embedding)";
-            format!("{dim} channels over {heads} heads: {rule}")
-        };
+            (key, !dim.is_multiple_of(4 * heads), format!("{dim} channels over {heads} heads: {rule}"))
+        });
         let completed = |needed: &str| format!("must be {needed} with `network.sides = \"completed\"`");
         let opposite = |key: &str| format!("must be 180 with `network.{key} = true`");
         let of_geometry = || "has no meaning where `regressor.start` is \"published\"".to_owned();
@@ -100,16 +102,6 @@ impl Config {
         // Both halves of an image have a whole number of pixels at every level.
         let is_halved = n.net_resolution.is_multiple_of(2 * n.patch);
         let problems = [
-            (
-                "network.enc_heads",
-                !n.enc_dim.is_multiple_of(4 * n.enc_heads),
-                per_head(n.enc_dim, n.enc_heads),
-            ),
-            (
-                "network.dec_heads",
-                !n.dec_dim.is_multiple_of(4 * n.dec_heads),
-                per_head(n.dec_dim, n.dec_heads),
-            ),
             (
                 "network.feature_dim",
                 !n.feature_dim.is_multiple_of(2),
@@ -186,7 +178,7 @@ impl Config {
                 "has no meaning where `mode.crop` is false".into(),
             ),
         ];
-        let (key, _, message) = problems.into_iter().find(|(_, is_refused, _)| *is_refused)?;
+        let (key, _, message) = heads.into_iter().chain(problems).find(|(_, is_refused, _)| *is_refused)?;
         Some((key, message))
     }
 

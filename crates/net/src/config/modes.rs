@@ -105,7 +105,7 @@ choices! {
         Mirrored,
     }
 
-    /// Float type of the point predictor's layers.
+    /// Float type of the point predictor's layers, and of weights in files.
     Precision {
         /// 24 bits of mantissa.
         F32,

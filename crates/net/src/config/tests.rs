@@ -2,71 +2,61 @@
 
 use super::*;
 
-fn refusal(text: &str, overrides: &[&str]) -> String {
+const COMPLETED: &str = "[network]\nsides = \"completed\"\nbody = \"convolution\"\nanchor = \"ray\"\nmask_channel = true\n\
+                         mirror = true\npatch = 8\n";
+const GEOMETRIC: &str = "[regressor]\nstart = \"geometric\"\n";
+const CLOSED: &str = "[network]\nclosed_top = true\n";
+
+fn config(text: &str, overrides: &[&str]) -> Result<Config, String> {
     let overrides: Vec<String> = overrides.iter().map(|s| (*s).to_owned()).collect();
-    Config::from_toml(text, "x.toml", &overrides).expect_err("refused").to_string()
+    Config::from_toml(text, "x.toml", &overrides).map_err(|e| e.to_string())
 }
 
+/// Completed sides need what they are made of. Limits of colours are shares of the range of corrected colours; limits
+/// and least opacities belong to a geometric start. A closed top needs Gaussians without a regressor.
 #[test]
-fn impossible_sizes_name_the_key() {
-    assert!(refusal("[network]\nenc_heads = 7\n", &[]).contains("network.enc_heads"));
-    assert!(refusal("[network]\nnet_resolution = 500\n", &[]).contains("network.net_resolution"));
-    assert!(refusal("[network]\nhooks = [0, 6, 9, 13]\n", &[]).contains("network.hooks"));
-    assert!(refusal("[regressor]\nnetworks = 3\n", &[]).contains("regressor.networks"));
-}
-
-#[test]
-fn completed_sides_need_what_they_are_made_of() {
-    let lines = "[network]\nsides = \"completed\"\nbody = \"convolution\"\nanchor = \"ray\"\nmask_channel = true\nmirror = true\n\
-                 patch = 8\n";
-    Config::from_toml(lines, "x", &[]).expect("valid");
-    for (set, key) in [
-        ("network.body=transformer", "network.body"),
-        ("network.anchor=none", "network.anchor"),
-        ("network.mask_channel=false", "network.mask_channel"),
-        ("network.mirror=false", "network.mirror"),
-        ("network.patch=16", "network.patch"),
-        ("network.net_resolution=8", "network.net_resolution"),
-        ("network.side_dims=[0,1,1,1]", "network.side_dims"),
+fn impossible_values_and_combinations_name_the_keys() {
+    for (text, set, key) in [
+        ("", "network.enc_heads=7", "network.enc_heads"),
+        ("", "network.net_resolution=500", "network.net_resolution"),
+        ("", "network.hooks=[0, 6, 9, 13]", "network.hooks"),
+        ("", "regressor.networks=3", "regressor.networks"),
+        ("", "network.second_layer=true", "network.second_layer"),
+        ("", "network.hull_reach=0.1", "network.hull_margin"),
+        // The head of a transformer has patches of 16 pixels.
+        (COMPLETED, "network.body=transformer", "network.patch"),
+        (COMPLETED, "network.anchor=none", "network.anchor"),
+        (COMPLETED, "network.mask_channel=false", "network.mask_channel"),
+        (COMPLETED, "network.mirror=false", "network.mirror"),
+        (COMPLETED, "network.patch=16", "network.patch"),
+        (COMPLETED, "network.net_resolution=8", "network.net_resolution"),
+        (COMPLETED, "network.side_dims=[0,1,1,1]", "network.side_dims"),
+        (GEOMETRIC, "regressor.color_limits=[0,0.1]", "regressor.color_limits"),
+        (GEOMETRIC, "regressor.color_limits=[0.1,1.5]", "regressor.color_limits"),
+        (GEOMETRIC, "regressor.color_limits=[0.1,nan]", "regressor.color_limits"),
+        ("", "regressor.color_limits=[0.1,0.1]", "regressor.start"),
+        (GEOMETRIC, "regressor.least_opacities=[-0.1,0]", "regressor.least_opacities"),
+        (GEOMETRIC, "regressor.least_opacities=[0,1.1]", "regressor.least_opacities"),
+        (GEOMETRIC, "regressor.least_opacities=[nan,0]", "regressor.least_opacities"),
+        ("", "regressor.least_opacities=[0.9,0.9]", "regressor.start"),
+        (CLOSED, "regressor.start=published", "network.closed_top"),
+        (CLOSED, "regressor.start=published", "regressor.start"),
     ] {
-        let message = refusal(lines, &[set]);
-        assert!(message.contains(key) && !message.contains("line"), "{set}: {message}");
+        let message = config(text, &[set]).expect_err(set);
+        let is_named = message.contains(&format!("`{key}"));
+        assert!(is_named && !message.contains("line"), "{set}: {message}");
     }
-    assert!(refusal("", &["network.second_layer=true"]).contains("network.second_layer"));
+    let message = config(CLOSED, &["regressor.start=geometric", "mode.compat=true"]).expect_err("compat");
+    assert!(message.contains("`network.closed_top`"), "{message}");
 }
 
 #[test]
-fn limits_of_colours_are_shares_of_the_range_of_corrected_colours() {
-    let geometric = "[regressor]\nstart = \"geometric\"\n";
-    let set = |limits: &str| format!("regressor.color_limits={limits}");
-    let config = Config::from_toml(geometric, "x", &[set("[0.03,0.1]")]).expect("valid");
-    assert_eq!(config.regressor.color_limits, [0.03, 0.1]);
-    for limits in ["[0,0.1]", "[0.1,1.5]", "[0.1,nan]"] {
-        assert!(refusal(geometric, &[&set(limits)]).contains("regressor.color_limits"), "{limits}");
-    }
-    assert!(refusal("", &[&set("[0.1,0.1]")]).contains("regressor.start"));
-}
-
-#[test]
-fn least_opacities_are_those_of_a_geometric_start() {
-    let geometric = "[regressor]\nstart = \"geometric\"\n";
-    let set = |least: &str| format!("regressor.least_opacities={least}");
-    let config = Config::from_toml(geometric, "x", &[set("[0.95,0]")]).expect("valid");
-    assert_eq!(config.regressor.least_opacities, [0.95, 0.0]);
-    for least in ["[-0.1,0]", "[0,1.1]", "[nan,0]"] {
-        assert!(refusal(geometric, &[&set(least)]).contains("regressor.least_opacities"), "{least}");
-    }
-    assert!(refusal("", &[&set("[0.9,0.9]")]).contains("regressor.start"));
-}
-
-#[test]
-fn a_closed_top_needs_gaussians_without_a_regressor() {
-    let closed = "[network]\nclosed_top = true\n";
-    assert!(Config::from_toml(closed, "x", &["regressor.start=geometric".to_owned()]).is_ok());
-    let message = refusal(closed, &[]);
-    assert!(message.contains("network.closed_top") && message.contains("regressor.start"), "{message}");
-    let message = refusal(closed, &["regressor.start=geometric", "mode.compat=true"]);
-    assert!(message.contains("network.closed_top"), "{message}");
+fn possible_combinations_are_accepted() {
+    let set = ["regressor.color_limits=[0.03,0.1]", "regressor.least_opacities=[0.95,0]"];
+    let regressor = config(GEOMETRIC, &set).expect("valid").regressor;
+    assert_eq!((regressor.color_limits, regressor.least_opacities), ([0.03, 0.1], [0.95, 0.0]));
+    config(COMPLETED, &[]).expect("valid");
+    config(CLOSED, &["regressor.start=geometric"]).expect("valid");
 }
 
 #[test]
@@ -76,9 +66,6 @@ fn the_reach_of_the_silhouettes_is_in_force_with_their_margin() {
         (&["network.hull_margin=8"], 0.05),
         (&["network.hull_margin=8", "network.hull_reach=0"], 0.0),
     ] {
-        let set: Vec<String> = set.iter().map(|s| (*s).to_owned()).collect();
-        let config = Config::from_toml("", "x", &set).expect("valid");
-        assert_eq!(config.network.hull_reach(), reach, "{set:?}");
+        assert_eq!(config("", set).expect("valid").network.hull_reach(), reach, "{set:?}");
     }
-    assert!(refusal("", &["network.hull_reach=0.1"]).contains("without `network.hull_margin`"));
 }

@@ -83,11 +83,7 @@ impl Completion {
             let rows = Visible::new(view, self.side, photographed.window, [&there, &inside], b);
             SideInput::new(view, self.side, photographed.window, (points.clone(), table.clone()), rows)
         });
-        let images: Vec<Tensor<4>> = seen
-            .iter()
-            .zip([false, true])
-            .map(|(seen, mirrored)| if mirrored { seen.image.clone().flip([3]) } else { seen.image.clone() })
-            .collect();
+        let images = vec![seen[0].image.clone(), seen[1].image.clone().flip([3])];
         let levels = self.body.encode(Tensor::cat(images, 0), Some(self.row_means(photographed.levels)));
         let out = self.body.decoder.out(self.body.features(&levels));
         let out = [out.clone().narrow(0, 0, b), out.narrow(0, b, b).flip([3])];

@@ -13,7 +13,7 @@ use crate::config::NetworkConfig;
 use snapsnap_ops::layers::{conv2d, enlarge};
 use snapsnap_ops::{as_weight, bilinear};
 
-pub(super) fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -> Conv2d {
+pub(crate) fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [3, 3])
         .with_stride([stride, stride])
         .with_padding(Explicit(1, 1, 1, 1))
@@ -21,7 +21,7 @@ pub(super) fn conv3x3(from: usize, to: usize, stride: usize, bias: bool, device:
         .init(device)
 }
 
-pub(super) fn conv1x1(from: usize, to: usize, device: &Device) -> Conv2d {
+pub(crate) fn conv1x1(from: usize, to: usize, device: &Device) -> Conv2d {
     Conv2dConfig::new([from, to], [1, 1]).with_padding(Valid).init(device)
 }
 

@@ -58,8 +58,9 @@ impl Dust3r {
         let decoder = |_| DecoderBlock::new(c.dec_dim, c.dec_heads, device);
         let head = |fused: bool| {
             let double = if fused && c.fusion == Fusion::Concat { 2 } else { 1 };
+            let widths = c.hooks.map(|hook| double * if hook == 0 { c.enc_dim } else { c.dec_dim });
             match c.head {
-                HeadKind::Dpt => Head::Dpt(DptHead::new(c, c.hook_widths().map(|w| double * w), device)),
+                HeadKind::Dpt => Head::Dpt(DptHead::new(c, widths, device)),
                 HeadKind::Linear => Head::Linear(LinearHead::new(double * c.dec_dim, c.patch, device)),
             }
         };

@@ -2,7 +2,7 @@
 
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor, TensorData};
-use glam::DVec3;
+use glam::Vec3;
 use snapsnap_splat::{Camera, RigidTransform};
 
 use crate::config::RegressorConfig;
@@ -74,9 +74,8 @@ impl Geometry {
     ) -> Self {
         let side = camera.width as usize;
         let RigidTransform { rotation, translation } = camera.world_to_camera;
-        let depth =
-            |point: [f32; 3]| (rotation.row(2).dot(DVec3::from(point.map(f64::from))) + translation.z) as f32;
-        let point = |i: usize| [points[3 * i], points[3 * i + 1], points[3 * i + 2]];
+        let depth = |point: Vec3| (rotation.row(2).dot(point.as_dvec3()) + translation.z) as f32;
+        let point = |i: usize| Vec3::from_slice(&points[3 * i..]);
         let (mut spacing, mut colors) = (Vec::new(), Vec::new());
         for i in (0..side * side).filter(|i| valid[*i]) {
             let (here, row, column) = (point(i), i / side, i % side);
@@ -87,12 +86,8 @@ impl Geometry {
                 (row > 0, i.wrapping_sub(side)),
                 (row + 1 < side, i + side),
             ];
-            let distance = |j: usize| {
-                let there = point(j);
-                (0..3).map(|c| (here[c] - there[c]).powi(2)).sum::<f32>().sqrt()
-            };
             let near = beside.into_iter().filter(|(inside, j)| *inside && valid[*j]);
-            let near = near.map(|(_, j)| distance(j)).filter(|d| *d <= MOST_SPACING * footprint);
+            let near = near.map(|(_, j)| here.distance(point(j))).filter(|d| *d <= MOST_SPACING * footprint);
             let (sum, count) = near.fold((0.0, 0), |(sum, count), d| (sum + d, count + 1));
             spacing.push(if count > 0 { (sum / count as f32).max(0.5 * footprint) } else { footprint });
             colors.extend([0, 1, 2].map(|c| image[c * side * side + i]));
@@ -167,17 +162,15 @@ fn unit(x: Tensor<2>) -> Tensor<2> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use snapsnap_ops::host;
 
-    fn values(x: Tensor<2>) -> Vec<f32> {
-        x.into_data().try_into_vec().expect("f32")
-    }
+    use super::*;
 
     /// The published scale at 0 is 6.931e-4 (docs/method.md, "Check values").
     #[test]
     fn softplus_has_its_published_value_and_stays_finite_at_the_extremes() {
         let device = Device::flex();
-        let got = values(sharp_softplus(Tensor::from_data([[0.0, 0.3, -0.05, 1e30, -1e30]], &device)));
+        let got = host(sharp_softplus(Tensor::from_data([[0.0, 0.3, -0.05, 1e30, -1e30]], &device)));
         let expected = [0.001 * std::f32::consts::LN_2, 0.03, 0.001 * (-5.0_f32).exp().ln_1p(), 1e29, 0.0];
         for (g, e) in got.iter().zip(expected) {
             assert!((g - e).abs() <= 1e-6 * e.abs().max(1e-3), "{got:?}");
@@ -197,18 +190,14 @@ mod tests {
         Attributes::new(Tensor::from_data([features], &device), Some(geometry))
     }
 
-    #[test]
-    fn without_corrections_colours_are_the_pixels() {
-        let made = attributes(8, 0.0, Limits { color: 1.0, opacity: 0.0 });
-        assert_eq!(values(made.color), [0.5, -0.25, 1.0]);
-    }
-
-    /// A small correction is the same for any limit. A large correction ends at the limit.
+    /// Without corrections, colours are the pixels'. A small correction is the same for any limit. A large correction
+    /// ends at the limit.
     #[test]
     fn corrections_of_colours_end_at_their_limit() {
         for limit in [0.06, 0.2, 1.0] {
-            let color =
-                |feature| values(attributes(8, feature, Limits { color: limit, opacity: 0.0 }).color)[0];
+            let colors = |feature| host(attributes(8, feature, Limits { color: limit, opacity: 0.0 }).color);
+            assert_eq!(colors(0.0), [0.5, -0.25, 1.0]);
+            let color = |feature| colors(feature)[0];
             assert!((color(0.01) - 0.51).abs() < 1e-4, "{limit}");
             for sign in [-1.0, 1.0] {
                 assert!((color(sign * 30.0) - 0.5 - sign * limit as f32).abs() < 1e-6, "{limit}");
@@ -221,7 +210,7 @@ mod tests {
         for (feature, least, expected) in
             [(0.0, 0.0, 0.9), (0.0, 0.8, 0.98), (-40.0, 0.8, 0.8), (40.0, 0.8, 1.0), (-40.0, 1.0, 1.0)]
         {
-            let opacity = values(attributes(0, feature, Limits { color: 1.0, opacity: least }).opacity)[0];
+            let opacity = host(attributes(0, feature, Limits { color: 1.0, opacity: least }).opacity)[0];
             assert!((opacity - expected).abs() < 1e-6, "{feature}, {least}");
         }
     }
@@ -231,7 +220,7 @@ mod tests {
         let device = Device::flex();
         let rows =
             Tensor::from_data([[3.0, 0.0, -4.0, 0.0], [1e30, 1e30, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]], &device);
-        let got = values(unit(rows));
+        let got = host(unit(rows));
         let half = std::f32::consts::FRAC_1_SQRT_2;
         let expected = [0.6, 0.0, -0.8, 0.0, half, half, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
         assert!(got.iter().zip(expected).all(|(g, e)| (g - e).abs() < 1e-6), "{got:?}");

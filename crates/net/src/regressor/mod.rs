@@ -3,22 +3,20 @@
 
 mod attributes;
 mod kernel;
-mod statistics;
 #[cfg(test)]
 mod tests;
 mod unet;
 
 use burn::module::Module;
-use burn::nn::PaddingConfig2d;
-use burn::nn::conv::{Conv2d, Conv2dConfig};
+use burn::nn::conv::Conv2d;
 use burn::tensor::{Device, Tensor};
 use snapsnap_ops::layers::conv2d;
 
-pub use crate::config::RECEPTIVE_RADIUS;
+use crate::network::conv1x1;
+use unet::{Normalise, UNet, normalise};
+
 pub use attributes::{Attributes, Geometry, Limits};
 pub use snapsnap_ops::regressor::{FEATURES, INPUT_CHANNELS};
-pub use statistics::Statistics;
-pub use unet::UNet;
 
 /// UNet and final 1×1 convolution. Field names are the checkpoint's.
 #[derive(Module, Debug)]
@@ -30,24 +28,22 @@ pub struct Regressor {
 impl Regressor {
     /// A regressor without values for its parameters yet.
     pub fn new(device: &Device) -> Self {
-        Self {
-            pred_unet: UNet::new(device),
-            gs_conv: Conv2dConfig::new([FEATURES, FEATURES], [1, 1])
-                .with_padding(PaddingConfig2d::Valid)
-                .init(device),
-        }
+        Self { pred_unet: UNet::new(device), gs_conv: conv1x1(FEATURES, FEATURES, device) }
     }
 
     /// Input `[B, 6, H, W]` with H and W multiples of 4 → features `[B, H, W, 14]`, before activation.
-    ///
-    /// Group-norm statistics are taken from `statistics` if frozen, else measured and added to it.
-    pub fn forward(&self, input: Tensor<4>, statistics: &mut Statistics) -> Tensor<4> {
+    pub fn forward(&self, input: Tensor<4>) -> Tensor<4> {
         let [_, channels, h, w] = input.dims();
         assert_eq!(channels, INPUT_CHANNELS, "regressor input must be [B, {INPUT_CHANNELS}, H, W]");
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
         if snapsnap_ops::has_kernels(&input) {
-            return kernel::regress(&self.pred_unet, &self.gs_conv, input, statistics);
+            return kernel::regress(&self.pred_unet, &self.gs_conv, input);
         }
-        conv2d(&self.gs_conv, self.pred_unet.forward(input, statistics), false).permute([0, 2, 3, 1])
+        self.composed(input, &mut normalise)
+    }
+
+    /// [`Self::forward`] in plain tensor code.
+    fn composed(&self, input: Tensor<4>, normalise: Normalise) -> Tensor<4> {
+        conv2d(&self.gs_conv, self.pred_unet.forward(input, normalise), false).permute([0, 2, 3, 1])
     }
 }

@@ -7,9 +7,11 @@ use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, FloatDType, Gradients, Tensor, TensorData};
 use rand::{RngCore, SeedableRng};
 
-use super::{FEATURES, Regressor, Statistics};
-use crate::config::Config;
+use super::unet::{normalise_with, statistics};
+use super::{FEATURES, INPUT_CHANNELS, Regressor};
+use crate::config::{Config, RECEPTIVE_RADIUS};
 use crate::weights::{NamedVisitor, ParameterPath, random_regressors, visit_named};
+use crate::window::Window;
 
 /// Relative L2 error of features. Kernels sum some hundred terms; rounding in f32 stays below a few 1e-6.
 const FEATURE: f64 = 5e-6;
@@ -77,27 +79,15 @@ fn gradients(regressor: &Regressor, gradients: &Gradients) -> BTreeMap<String, V
 #[test]
 fn kernels_equal_the_plain_network_forward_and_backward() {
     let device = Device::flex().autodiff();
-    for ([b, height, width], freeze) in [
-        ([1, 32, 44], false),
-        ([2, 20, 12], false),
-        ([3, 32, 8], false),
-        ([1, 36, 68], false),
-        ([2, 12, 20], true),
-        ([1, 8, 140], true),
-    ] {
-        let what = format!("{b}×{height}×{width}, frozen {freeze}");
+    for [b, height, width] in [[1, 32, 44], [2, 20, 12], [3, 32, 8], [1, 36, 68], [1, 8, 140], [1, 96, 160]] {
+        let what = format!("{b}×{height}×{width}");
         let upstream = random([b, height, width, FEATURES], 3, &device);
         // Means away from 0, as z ≈ 2 m is.
-        let image = |seed| random([b, 6, height, width], seed, &device) + 1.0;
+        let image = random([b, 6, height, width], 2, &device) + 1.0;
         let [fast, plain] = regressors(&device);
         let run = |regressor: &Regressor, float: FloatDType| {
-            let mut statistics = Statistics::measured();
-            if freeze {
-                regressor.forward(image(4).cast(float), &mut statistics);
-                statistics = statistics.frozen();
-            }
-            let input = image(2).cast(float).require_grad();
-            let features = regressor.forward(input.clone(), &mut statistics);
+            let input = image.clone().cast(float).require_grad();
+            let features = regressor.forward(input.clone());
             let all = (features.clone() * upstream.clone().cast(float)).sum().backward();
             let of_input = values(input.grad(&all).expect("tracked"));
             (values(features), of_input, gradients(regressor, &all))
@@ -117,22 +107,45 @@ fn kernels_equal_the_plain_network_forward_and_backward() {
     }
 }
 
+/// With the group norms' statistics of the whole image, so that only the pixels of the window count.
 #[test]
-fn each_path_reads_the_statistics_of_the_other() {
-    let device = Device::flex();
-    let config = Config::default();
-    let regressor = random_regressors(&config, 5, &device).remove(0);
-    let plain = |x: Tensor<4>, statistics: &mut Statistics| {
-        regressor.gs_conv.forward(regressor.pred_unet.forward(x, statistics)).permute([0, 2, 3, 1])
+fn cropping_changes_nothing_inside_the_mask_with_the_same_statistics() {
+    let device = Device::flex().autodiff();
+    let [_, regressor] = regressors(&device);
+    let (regressor, side) = (regressor.no_grad(), 288);
+    let mut mask = vec![false; side * side];
+    for y in 126..162 {
+        mask[y * side + 130..y * side + 158].fill(true);
+    }
+    let person = Window::around([mask.as_slice()].into_iter(), side).expect("pixels");
+    let image = random([1, INPUT_CHANNELS, side, side], 5, &device).cast(FloatDType::F64);
+    let inside = |features: Tensor<4>, window: &Window| -> Vec<f64> {
+        let features = values(features);
+        let rows = window.indices(&mask, side);
+        rows.iter().flat_map(|&i| features[i as usize * FEATURES..][..FEATURES].to_vec()).collect()
     };
-    let image = |seed| random([2, 6, 20, 36], seed, &device) + 2.0;
-    let (mut measured, mut composed) = (Statistics::measured(), Statistics::measured());
-    regressor.forward(image(1), &mut measured);
-    plain(image(1), &mut composed);
-    let got = values(regressor.forward(image(2), &mut composed.frozen()));
-    let expected = values(plain(image(2), &mut measured.frozen()));
-    // Both paths are f32 here.
-    assert!(error(&got, &expected) < 2.0 * FEATURE, "{:e}", error(&got, &expected));
+    let mut layers = Vec::new();
+    let whole = regressor.composed(image.clone(), &mut |norm, x| {
+        layers.push(statistics(norm, &x));
+        normalise_with(norm, x, layers[layers.len() - 1].clone())
+    });
+    let expected = inside(whole, &Window::whole(side));
+    let cropped = |window: &Window| {
+        let mut layers = layers.iter().cloned();
+        let features = regressor.composed(window.cut(image.clone()), &mut |norm, x| {
+            normalise_with(norm, x, layers.next().expect("as many norms"))
+        });
+        error(&inside(features, window), &expected)
+    };
+    let padded = person.padded(RECEPTIVE_RADIUS, side);
+    assert!(padded.rows.len() < side && padded.columns.len() < side, "the window is a real crop");
+    let apart = cropped(&padded);
+    println!("cropped with a margin of {RECEPTIVE_RADIUS} pixels: relative error {apart:.2e}");
+    assert!(apart < 1e-6, "{apart:e}");
+    // Without the margin there is a difference, so the test can fail.
+    let apart = cropped(&Window { rows: 124..164, columns: 128..160 });
+    println!("cropped without a margin: relative error {apart:.2e}");
+    assert!(apart > 1e-4, "{apart:e}");
 }
 
 /// Features, and gradients by the input and by the parameters, where tracked.
@@ -147,7 +160,7 @@ fn pass(track_input: bool, track_parameters: bool) -> Pass {
         regressor = regressor.no_grad();
     }
     let input = (random([b, 6, height, width], 2, &device) + 1.0).set_require_grad(track_input);
-    let features = regressor.forward(input.clone(), &mut Statistics::measured());
+    let features = regressor.forward(input.clone());
     let got = values(features.clone());
     if !track_input && !track_parameters {
         return (got, None, None);

@@ -12,8 +12,8 @@ use snapsnap_base::file::write_whole;
 
 use super::WeightsError;
 use super::schema::{self, Part, TensorSpec};
-use super::source::{CONFIG_KEY, Entry, Float, Source, is_readable};
-use crate::config::{Config, Schema};
+use super::source::{CHUNK, CONFIG_KEY, Entry, Source};
+use crate::config::{Config, Precision, Schema};
 
 /// Called with the number of bytes written and their total.
 pub type Progress<'a> = &'a dyn Fn(u64, u64);
@@ -33,8 +33,6 @@ const POINTS: [&str; 8] = [
 ];
 /// Keys that change the meaning of the regressor's tensors.
 const GAUSSIANS: [&str; 2] = ["mode.rotation_frame", "regressor.start"];
-/// Values per task: a second-level cache holds them.
-const CHUNK: usize = 1 << 16;
 
 /// Writes `tensors` in order. `values` returns one tensor at a time, so that only one is in memory. If values are not
 /// finite, the error names all their tensors and `origin`, and no file is written.
@@ -43,7 +41,7 @@ pub(super) fn write(
     origin: &str,
     config: &Config,
     tensors: &[TensorSpec],
-    float: Float,
+    float: Precision,
     mut values: impl FnMut(&TensorSpec) -> Result<Vec<f32>, WeightsError>,
     progress: Progress,
 ) -> Result<(), WeightsError> {
@@ -64,7 +62,7 @@ pub fn write_tensors(
     origin: &str,
     metadata: HashMap<String, String>,
     tensors: Vec<(String, Vec<usize>)>,
-    float: Float,
+    float: Precision,
     mut values: impl FnMut(usize) -> Result<Vec<f32>, WeightsError>,
     progress: Progress,
 ) -> Result<(), WeightsError> {
@@ -73,30 +71,21 @@ pub fn write_tensors(
     let infos = tensors.into_iter().map(|(name, shape)| {
         let from = at;
         at += shape.iter().product::<usize>() * float.size();
-        (name, TensorInfo { dtype: float.dtype(), shape, data_offsets: (from, at) })
+        (name, TensorInfo { dtype: float.in_safetensors(), shape, data_offsets: (from, at) })
     });
     let header = Metadata::new(Some(metadata), infos.collect()).expect("consecutive, exactly sized tensors");
     let mut header = serde_json::to_vec(&header).expect("the header has only JSON types");
     // The format requires data aligned to 8 bytes and allows spaces for that.
     header.resize(header.len().next_multiple_of(8), b' ');
 
-    // Errors of both kinds pass through `write_whole`.
-    enum Failure {
-        Io(io::Error),
-        Weights(WeightsError),
-    }
-    impl From<io::Error> for Failure {
-        fn from(e: io::Error) -> Self {
-            Self::Io(e)
-        }
-    }
+    // Errors of weights pass through `write_whole` as errors of the operating system.
     write_whole(path, |out| {
         out.write_all(&(header.len() as u64).to_le_bytes())?;
         out.write_all(&header)?;
         let mut written = 0;
         let mut problems = Vec::new();
         for (i, name) in names.iter().enumerate() {
-            let bytes = float.bytes(&values(i).map_err(Failure::Weights)?);
+            let bytes = float.bytes(&values(i).map_err(io::Error::other)?);
             // Values beyond the range of 16 bits are infinite now.
             problems.extend(not_finite(name, &float.widened(&bytes)));
             out.write_all(&bytes)?;
@@ -106,12 +95,9 @@ pub fn write_tensors(
         if problems.is_empty() {
             return Ok(());
         }
-        Err(Failure::Weights(WeightsError::Tensors { origin: origin.to_owned(), problems }))
+        Err(io::Error::other(WeightsError::Tensors { origin: origin.to_owned(), problems }))
     })
-    .map_err(|e| match e {
-        Failure::Io(e) => FileError::write(path)(e).into(),
-        Failure::Weights(e) => e,
-    })
+    .map_err(|e| e.downcast::<WeightsError>().unwrap_or_else(|e| FileError::write(path)(e).into()))
 }
 
 /// Writes the values of parameters, with the names and layouts of checkpoints, as a weight file of `config`. Values
@@ -130,7 +116,7 @@ pub fn save(config: &Config, values: &BTreeMap<String, Vec<f32>>, path: &Path) -
         assert_eq!(values.len(), spec.elements(), "{}", spec.name);
         Ok(values.clone())
     };
-    write(path, &path.display().to_string(), config, &tensors, Float::F32, read, &|_, _| ())
+    write(path, &path.display().to_string(), config, &tensors, Precision::F32, read, &|_, _| ())
 }
 
 /// A line for a tensor with values that are not finite.
@@ -283,7 +269,7 @@ pub(super) fn parts_of<'a>(keys: impl Iterator<Item = &'a String>) -> HashSet<Pa
 
 /// A line for a tensor of the wrong shape or type.
 pub(super) fn mismatch(spec: &TensorSpec, entry: &Entry, path: &Path) -> Option<String> {
-    if !is_readable(&entry.dtype) {
+    if Precision::called(&entry.dtype).is_none() {
         return Some(format!(
             "wrong type: {} is {} in {}, must be f32, f16 or bf16",
             spec.name,

@@ -1,15 +1,16 @@
-//! Importing the authors' checkpoints, strictly: every tensor is accounted for by name, or nothing is written.
+//! Importing the authors' checkpoints, strictly: every tensor is accounted for by name, or nothing is written. And our
+//! weight file back in the authors' layout.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::slice;
 
 use super::WeightsError;
-use super::file::{Progress, mismatch, parts_of, write};
+use super::file::{Progress, WeightFile, mismatch, parts_of, write, write_tensors};
 use super::init::{SideHeads, draw};
 use super::schema::{self, DUST3R, Part, SCALE, SIDE, TensorSpec, UNET};
-use super::source::{CONFIG_KEY, Float, Source, is_readable};
-use crate::config::Config;
+use super::source::{CONFIG_KEY, Source};
+use crate::config::{Config, Precision};
 
 /// Choices an import leaves to the user.
 #[derive(Debug, Clone, Copy)]
@@ -21,7 +22,7 @@ pub struct ImportOptions<'a> {
     /// Seed of random values.
     pub seed: u64,
     /// Float type of the written file.
-    pub float: Float,
+    pub float: Precision,
 }
 
 /// The config in the metadata of weight files: `[regressor]`, `mode.rotation_frame` and `mode.crop` of the first file
@@ -62,13 +63,8 @@ pub struct ImportReport {
     pub notes: Vec<String>,
 }
 
-/// Where a tensor's values come from.
-#[derive(Clone)]
-enum Origin<'a> {
-    File(&'a Source, String),
-    /// Its initial distribution.
-    Drawn,
-}
+/// A file and a key in it.
+type Place<'a> = (&'a Source, String);
 
 /// Keys of the authors' files that neither inference nor training uses.
 fn is_ignored(key: &str) -> bool {
@@ -76,7 +72,7 @@ fn is_ignored(key: &str) -> bool {
 }
 
 /// The second name under which PyTorch lists a `layerN_rn` convolution (docs/method.md, "Weight files").
-pub(super) fn alias_of(name: &str) -> Option<String> {
+fn alias_of(name: &str) -> Option<String> {
     let (head, digit) = name.strip_suffix("_rn.weight")?.rsplit_once("scratch.layer")?;
     let n: usize = digit.parse().ok()?;
     Some(format!("{head}scratch.layer_rn.{}.weight", n - 1))
@@ -152,9 +148,9 @@ pub fn import(
     }
 
     let mut next = plan.iter();
-    let values = |spec: &TensorSpec| match next.next().expect("one origin per tensor") {
-        Origin::Drawn => Ok(draw(spec, options.seed)),
-        Origin::File(source, key) => source.read_f32(key),
+    let values = |spec: &TensorSpec| match next.next().expect("one entry per tensor") {
+        None => Ok(draw(spec, options.seed)),
+        Some((source, key)) => source.read_f32(key),
     };
     write(to, &origin, config, &specs, options.float, values, progress)?;
     report.tensors = specs.len();
@@ -175,14 +171,15 @@ fn head(k: usize) -> String {
     format!("{DUST3R}downstream_head{k}.")
 }
 
-/// One origin per tensor of `specs`, in order. Tensors without an origin and unused keys are problems.
+/// The place of each tensor of `specs`, in order; `None` for tensors that are drawn. Tensors without an origin and
+/// unused keys are problems.
 fn plan<'a>(
     specs: &[TensorSpec],
     mut found: Found<'a>,
     (options, lacks_heads): (ImportOptions<'_>, bool),
     problems: &mut Vec<String>,
     report: &mut ImportReport,
-) -> Vec<Origin<'a>> {
+) -> Vec<Option<Place<'a>>> {
     let wanted = |k: &usize| specs.iter().any(|spec| spec.name.starts_with(&head(*k)));
     let given = |k: &usize| found.keys().any(|key| key.starts_with(&head(*k)));
     let absent: Vec<usize> = (1..=4).filter(|k| lacks_heads && wanted(k) && !given(k)).collect();
@@ -195,13 +192,13 @@ fn plan<'a>(
         });
     }
 
-    let mut plan: Vec<Origin> = Vec::new();
+    let mut plan: Vec<Option<Place>> = Vec::new();
     for spec in specs {
         let of_absent_head = absent.iter().find(|k| spec.name.starts_with(&head(**k)));
         let origin = match (found.remove(&spec.name), of_absent_head) {
             (Some((source, key)), _) => {
                 problems.extend(mismatch(spec, &source.tensors()[&key], source.path()));
-                Origin::File(source, key)
+                Some((source, key))
             }
             (None, Some(&k)) if k > 2 && options.side_heads == SideHeads::Copy => {
                 let twin = spec.name.replace(&head(k), &head(k - 2));
@@ -213,17 +210,17 @@ fn plan<'a>(
                         "cannot copy: {} needs {:?}, {twin} has {:?} (fusion = \"concat\" doubles the side heads' inputs)",
                         spec.name, spec.shape, specs[at].shape
                     ));
-                    Origin::Drawn
+                    None
                 }
             }
-            (None, Some(_)) => Origin::Drawn,
+            (None, Some(_)) => None,
             (None, None) if spec.name == SCALE => {
                 report.notes.push("δ (`scale`) is in no file: `network.delta` of the config".into());
-                Origin::Drawn
+                None
             }
             (None, None) => {
                 problems.push(format!("missing: {} {:?}", spec.name, spec.shape));
-                Origin::Drawn
+                None
             }
         };
         plan.push(origin);
@@ -235,7 +232,8 @@ fn plan<'a>(
     plan
 }
 
-type Found<'a> = BTreeMap<String, (&'a Source, String)>;
+/// Places by canonical names.
+type Found<'a> = BTreeMap<String, Place<'a>>;
 
 /// Every tensor of every source under its canonical name; aliases are compared, clashes are problems.
 fn collect<'a>(
@@ -271,8 +269,8 @@ fn collect<'a>(
 }
 
 fn same_bits(source: &Source, a: &str, b: &str) -> Result<bool, WeightsError> {
-    let entry = |key: &str| &source.tensors()[key];
-    if entry(a).shape != entry(b).shape || entry(a).dtype != entry(b).dtype || !is_readable(&entry(a).dtype) {
+    let [entry, other] = [a, b].map(|key| &source.tensors()[key]);
+    if entry.shape != other.shape || entry.dtype != other.dtype || Precision::called(&entry.dtype).is_none() {
         return Ok(false);
     }
     let (a, b) = (source.read_f32(a)?, source.read_f32(b)?);
@@ -293,4 +291,26 @@ fn copy_decoder(found: &mut Found, report: &mut ImportReport) {
         report.notes.push("`dec_blocks2` is in no file: copied from `dec_blocks`".into());
         found.extend(copies);
     }
+}
+
+/// Writes `from` (our file) to `to` with every name of the authors' state dicts, aliases included, and without our
+/// metadata, so that a strict `load_state_dict` accepts each part. Values that are not finite are refused, as in an
+/// import. Returns the number of tensors written.
+///
+/// # Errors
+/// [`WeightsError`].
+pub fn export(from: &Path, to: &Path, progress: Progress) -> Result<usize, WeightsError> {
+    let file = WeightFile::open(from, None)?;
+    let mut entries: Vec<(String, &str)> = Vec::new();
+    for name in file.source.tensors().keys() {
+        entries.push((name.clone(), name));
+        entries.extend(alias_of(name).map(|alias| (alias, name.as_str())));
+    }
+    let shapes =
+        entries.iter().map(|(alias, name)| (alias.clone(), file.source.tensors()[*name].shape.clone()));
+    let metadata = HashMap::from([("format".to_owned(), "pt".to_owned())]);
+    let values = |i: usize| file.source.read_f32(entries[i].1);
+    let origin = from.display().to_string();
+    write_tensors(to, &origin, metadata, shapes.collect(), Precision::F32, values, progress)?;
+    Ok(entries.len())
 }

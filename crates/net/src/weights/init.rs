@@ -9,8 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use super::WeightsError;
 use super::file::{Progress, write};
 use super::schema::{self, Init, TensorSpec};
-use super::source::Float;
-use crate::config::Config;
+use crate::config::{Config, Precision};
 
 /// Where the side heads come from when a checkpoint has none.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,7 +47,7 @@ fn fnv1a(text: &str) -> u64 {
 /// [`WeightsError::File`].
 pub fn init(config: &Config, seed: u64, path: &Path, progress: Progress) -> Result<usize, WeightsError> {
     let tensors = schema::tensors(config);
-    write(path, "random weights", config, &tensors, Float::F32, |spec| Ok(draw(spec, seed)), progress)?;
+    write(path, "random weights", config, &tensors, Precision::F32, |spec| Ok(draw(spec, seed)), progress)?;
     Ok(tensors.iter().map(TensorSpec::elements).sum())
 }
 

@@ -1,9 +1,9 @@
 //! Checkpoints: reading the authors' files, our own file format, and filling the networks from it.
 //!
 //! Our file is one `.safetensors` with the authors' keys (`scale`, `dust3r.*`, `pred_unet.*`, `gs_conv.*`) and this
-//! project's keys (`unet.*`, `side.*`), in one [`Float`] type, and the config as TOML in its metadata.
+//! project's keys (`unet.*`, `side.*`), in one [`Precision`](crate::config::Precision), and the config as TOML in its
+//! metadata.
 
-mod export;
 mod file;
 mod import;
 mod init;
@@ -15,12 +15,11 @@ use snapsnap_base::FileError;
 use snapsnap_base::config::ConfigError;
 
 pub use crate::parameters::{NamedMapper, NamedVisitor, ParameterPath, map_named, visit_named};
-pub use export::export;
 pub use file::{Progress, WeightFile, not_finite, save, write_tensors};
-pub use import::{ImportOptions, ImportReport, import, stored_config};
+pub use import::{ImportOptions, ImportReport, export, import, stored_config};
 pub use init::{SideHeads, init};
 pub use load::{random_predictor, random_regressors};
-pub use source::{CONFIG_KEY, Entry, Float, Source};
+pub use source::{Entry, Source};
 
 /// The first problems, a line each, and the number of the others.
 fn listed(problems: &[String]) -> String {

@@ -169,15 +169,4 @@ mod tests {
         assert_eq!(init("pred_unet.norm_out.bias"), Init::Constant(0.0));
         assert_eq!(init("scale"), Init::Constant(5.0));
     }
-
-    #[test]
-    fn no_key_is_listed_twice() {
-        let mut config = Config::default();
-        config.regressor.networks = 2;
-        let mut names: Vec<_> = tensors(&config).into_iter().map(|t| t.name).collect();
-        let count = names.len();
-        names.sort();
-        names.dedup();
-        assert_eq!(names.len(), count);
-    }
 }

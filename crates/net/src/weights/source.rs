@@ -13,7 +13,7 @@ use safetensors::tensor::Metadata;
 use snapsnap_base::{FileError, file};
 
 use super::WeightsError;
-use crate::config::{Config, Schema};
+use crate::config::{Config, Precision, Schema};
 
 /// Metadata key under which the config (TOML) is stored.
 pub const CONFIG_KEY: &str = "snapsnap.config";
@@ -178,7 +178,7 @@ impl Source {
             .tensors
             .get(name)
             .ok_or_else(|| FileError::unsuitable(&self.path, format!("has no tensor `{name}`")))?;
-        let kind = Float::called(&entry.dtype).ok_or_else(|| {
+        let kind = Precision::called(&entry.dtype).ok_or_else(|| {
             FileError::unsuitable(&self.path, format!("`{name}` is {}, not f32, f16 or bf16", entry.dtype))
         })?;
         let values = match &self.reader {
@@ -193,34 +193,15 @@ impl Source {
     }
 }
 
-/// Whether tensors of this type can become f32 without loss.
-pub fn is_readable(dtype: &str) -> bool {
-    Float::called(dtype).is_some()
-}
-
-/// Types of numbers that f32 holds without loss.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Float {
-    /// 32 bits.
-    F32,
-    /// 16 bits, IEEE.
-    F16,
-    /// The upper 16 bits of f32.
-    Bf16,
-}
-
-impl Float {
-    fn called(dtype: &str) -> Option<Self> {
-        match dtype {
-            "f32" => Some(Self::F32),
-            "f16" => Some(Self::F16),
-            "bf16" => Some(Self::Bf16),
-            _ => None,
-        }
+/// Numbers in files. f32 holds all of them without loss.
+impl Precision {
+    /// The type of this name; `None` for types whose tensors cannot become f32 without loss.
+    pub(super) fn called(name: &str) -> Option<Self> {
+        [Self::F32, Self::Bf16, Self::F16].into_iter().find(|one| one.name() == name)
     }
 
     /// Name in a safetensors file.
-    pub(super) fn dtype(self) -> Dtype {
+    pub(super) fn in_safetensors(self) -> Dtype {
         match self {
             Self::F32 => Dtype::F32,
             Self::F16 => Dtype::F16,
@@ -266,11 +247,11 @@ impl Float {
 }
 
 /// Values that are read and widened at a time: few enough to stay in the second-level cache.
-const CHUNK: usize = 1 << 16;
+pub(super) const CHUNK: usize = 1 << 16;
 
 /// The values of one tensor, read by all cores. The first touch of fresh memory takes most of the time, so each page
 /// of the result is touched once, by the core that fills it.
-fn read_values(file: &File, entry: &Entry, kind: Float) -> io::Result<Vec<f32>> {
+fn read_values(file: &File, entry: &Entry, kind: Precision) -> io::Result<Vec<f32>> {
     let count = entry.len / kind.size();
     let mut values = vec![0.0_f32; count];
     values

@@ -15,7 +15,7 @@
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 #[cfg(test)]
-pub(crate) mod tests;
+mod tests;
 
 /// Pairs of k in a block.
 pub const PAIRS: usize = 16;

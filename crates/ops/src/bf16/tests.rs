@@ -1,6 +1,7 @@
 //! Products of bf16 factors against f64.
 
 use super::*;
+use crate::multiply::{self, Right};
 use crate::testing::uniform;
 
 /// Nearest bf16, ties to even.
@@ -32,27 +33,19 @@ fn products_equal_those_of_rounded_factors() {
                 .enumerate()
         {
             let (lhs, rhs) = (uniform(2 * m * k, 1), uniform(2 * k * n, 2));
-            {
-                let right = crate::multiply::Right::packed([k, n], (&rhs, rs));
-                for add in [false, true] {
-                    let stride = n + 3;
-                    let mut out = vec![0.5; m * stride];
-                    crate::multiply::Multiply { size: [m, n, k], lhs: (&lhs, ls), rhs: &right, add }
-                        .write(&mut out, stride);
-                    for (row, out) in out.chunks_exact(stride).enumerate() {
-                        for (column, got) in out.iter().enumerate() {
-                            let inside = column < n;
-                            let terms = (0..if inside { k } else { 0 }).map(|i| {
-                                let (a, b) = (lhs[row * ls[1] + i * ls[0]], rhs[i * rs[1] + column * rs[0]]);
-                                f64::from(nearest(a)) * f64::from(nearest(b))
-                            });
-                            let expected = terms.sum::<f64>() + if add || !inside { 0.5 } else { 0.0 };
-                            let error = (f64::from(*got) - expected).abs();
-                            assert!(
-                                error < 2e-5,
-                                "{m}×{n}×{k}, order {i}, {row}, {column}: {got}, {expected}"
-                            );
-                        }
+            let right = Right::packed([k, n], (&rhs, rs));
+            for add in [false, true] {
+                let mut out = vec![0.5; m * n];
+                multiply::product([m, n, k], (&lhs, ls), &right, &mut out, add);
+                for (row, out) in out.chunks_exact(n).enumerate() {
+                    for (column, got) in out.iter().enumerate() {
+                        let terms = (0..k).map(|i| {
+                            let (a, b) = (lhs[row * ls[1] + i * ls[0]], rhs[i * rs[1] + column * rs[0]]);
+                            f64::from(nearest(a)) * f64::from(nearest(b))
+                        });
+                        let expected = terms.sum::<f64>() + if add { 0.5 } else { 0.0 };
+                        let error = (f64::from(*got) - expected).abs();
+                        assert!(error < 2e-5, "{m}×{n}×{k}, order {i}, {row}, {column}: {got}, {expected}");
                     }
                 }
             }
@@ -73,10 +66,9 @@ fn rounding_keeps_what_is_not_finite() {
     if !can_try() {
         return;
     }
-    let right = crate::multiply::Right::packed([1, 5], (&values, [1, 5]));
+    let right = Right::packed([1, 5], (&values, [1, 5]));
     let mut out = [0.0; 5];
-    crate::multiply::Multiply { size: [1, 5, 1], lhs: (&[1.0], [1, 1]), rhs: &right, add: false }
-        .write(&mut out, 5);
+    multiply::product([1, 5, 1], (&[1.0], [1, 1]), &right, &mut out, false);
     assert!(
         out[0] == f32::INFINITY && out[1] == f32::NEG_INFINITY && out[2].is_nan() && out[3].is_nan(),
         "{out:?}"

@@ -8,10 +8,11 @@ use pulp::Arch;
 use rayon::prelude::*;
 
 use super::kernels::{Products, Row, Strided, Tap, square};
-use super::rows::{Activate, Descend, Fill, Sum, Upstream, double, halve};
+use super::rows::{Descend, Fill, Upstream, activate, double, halve, sum};
 use super::weights::transpose;
 use super::{CHANNELS, Plane, Source};
 use crate::buffers::Floats;
+use crate::vectors::vectorized;
 
 /// Columns that are processed while they are in the first-level cache; a multiple of every kernel's block of pixels.
 const CHUNK: usize = 120;
@@ -170,8 +171,7 @@ impl<'a> Band<'a> {
                 let pixels = if rest < CHUNK + REST { rest } else { CHUNK };
                 if self.pass.wanted.parameters && self.held[(y + 1) % 3].1 {
                     let slot = &self.slots[(y + 1) % 3][(start + 1) * CHANNELS..][..pixels * CHANNELS];
-                    let sum = Arch::new().dispatch(Sum(slot));
-                    self.sums.bias.iter_mut().zip(sum).for_each(|(all, s)| *all += f64::from(s));
+                    self.sums.bias.iter_mut().zip(sum(slot)).for_each(|(all, s)| *all += f64::from(s));
                 }
                 for source in 0..self.pass.sources.len() {
                     self.chunk(source, [row, part], row - rows.start, start, pixels);
@@ -191,11 +191,14 @@ impl<'a> Band<'a> {
     fn flush(&mut self) {
         let (products, count) = &mut self.products;
         let weights = &mut self.sums.weights;
-        Arch::new().dispatch(|| {
-            for (all, part) in weights.iter_mut().zip(products.iter_mut()) {
-                *all += f64::from(std::mem::take(part));
-            }
-        });
+        vectorized(
+            #[inline(always)]
+            || {
+                for (all, part) in weights.iter_mut().zip(products.iter_mut()) {
+                    *all += f64::from(std::mem::take(part));
+                }
+            },
+        );
         *count = 0;
     }
 
@@ -228,7 +231,7 @@ impl<'a> Band<'a> {
         let (values, slopes) = (&mut self.values[..pixels * CHANNELS], &mut self.slopes[..pixels * CHANNELS]);
         let values = match affine {
             Some(affine) => {
-                arch.dispatch(Activate { input, affine, values, slopes });
+                activate(input, affine, values, slopes);
                 values
             }
             None if factor == 2 => {

@@ -1,12 +1,13 @@
 //! The forward pass of one convolution, band by band.
 
-use pulp::{Arch, Simd, WithSimd};
+use pulp::Arch;
 use rayon::prelude::*;
 
 use super::kernels::{Row, Strided, Tap, square};
 use super::{CHANNELS, Moments, Plane, Source};
 use crate::buffers::Floats;
 use crate::math::silu;
+use crate::vectors::vectorized;
 
 /// Output rows per task.
 const BAND: usize = 16;
@@ -74,7 +75,7 @@ impl Conv<'_> {
                     held[slot] = padded;
                     for (source, slots) in self.sources.iter().zip(&mut slots) {
                         let row = (1..=rows).contains(&padded).then(|| padded - 1);
-                        arch.dispatch(Fill { source, row, enlarge: self.enlarge, out: &mut slots[slot] });
+                        fill(source, row, self.enlarge, &mut slots[slot]);
                     }
                 }
             }
@@ -103,7 +104,7 @@ impl Conv<'_> {
                 1 => arch.dispatch(Strided::<1>(row)),
                 _ => arch.dispatch(Strided::<2>(row)),
             }
-            let of_row = arch.dispatch(
+            let of_row = vectorized(
                 #[inline(always)]
                 || Moments::of_row(out),
             );
@@ -114,36 +115,29 @@ impl Conv<'_> {
 }
 
 /// Writes one activated row of a source to `out` `[columns + 2, 16]`, with 0 at both ends. Without a row, all is 0.
-struct Fill<'a> {
-    source: &'a Source<'a>,
-    row: Option<usize>,
-    enlarge: bool,
-    out: &'a mut [f32],
-}
-
-impl WithSimd for Fill<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let Some(row) = self.row else {
-            self.out.fill(0.0);
-            return;
-        };
-        let (plane, factor) = (self.source.plane, if self.enlarge { 2 } else { 1 });
-        let line = plane.width * CHANNELS;
-        let (pixels, _) = plane.data[row / factor * line..][..line].as_chunks::<CHANNELS>();
-        let end = self.out.len() - CHANNELS;
-        let (out, _) = self.out[CHANNELS..end].as_chunks_mut::<CHANNELS>();
-        for (x, pixel) in pixels.iter().enumerate() {
-            let mut value = *pixel;
-            if let Some([scale, shift]) = &self.source.affine {
-                for c in 0..CHANNELS {
-                    value[c] = silu(value[c] * scale[c] + shift[c]);
+fn fill(source: &Source, row: Option<usize>, enlarge: bool, out: &mut [f32]) {
+    let Some(row) = row else {
+        out.fill(0.0);
+        return;
+    };
+    let (plane, affine, factor) = (source.plane, source.affine, if enlarge { 2 } else { 1 });
+    let line = plane.width * CHANNELS;
+    let (pixels, _) = plane.data[row / factor * line..][..line].as_chunks::<CHANNELS>();
+    let end = out.len() - CHANNELS;
+    let (out, _) = out[CHANNELS..end].as_chunks_mut::<CHANNELS>();
+    vectorized(
+        #[inline(always)]
+        move || {
+            for (x, pixel) in pixels.iter().enumerate() {
+                let mut value = *pixel;
+                if let Some([scale, shift]) = &affine {
+                    for c in 0..CHANNELS {
+                        value[c] = silu(value[c] * scale[c] + shift[c]);
+                    }
                 }
+                out[x * factor] = value;
+                out[x * factor + factor - 1] = value;
             }
-            out[x * factor] = value;
-            out[x * factor + factor - 1] = value;
-        }
-    }
+        },
+    );
 }

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::CHANNELS;
 use super::kernels::{Products, Row, Strided, Tap};
 use super::norm::Linear;
+use crate::vectors::vectorized;
 
 /// Pixels that are processed while they are in the first-level cache; a multiple of every kernel's block of pixels.
 const CHUNK: usize = 60;
@@ -65,7 +66,10 @@ impl Merge<'_> {
                 None => branch.fill(0.0),
                 Some(Branch { upstream, scale, projection: None }) => {
                     let upstream = &upstream[range.clone()];
-                    arch.dispatch(|| branch.iter_mut().zip(upstream).for_each(|(b, g)| *b = g * scale));
+                    vectorized(
+                        #[inline(always)]
+                        || branch.iter_mut().zip(upstream).for_each(|(b, g)| *b = g * scale),
+                    );
                 }
                 Some(Branch { upstream, scale, projection: Some(weights) }) => {
                     let row = &upstream[range.clone()];
@@ -78,7 +82,10 @@ impl Merge<'_> {
             }
             if let Some(other) = self.other {
                 let other = &other[range];
-                arch.dispatch(|| branch.iter_mut().zip(other).for_each(|(b, g)| *b += g));
+                vectorized(
+                    #[inline(always)]
+                    || branch.iter_mut().zip(other).for_each(|(b, g)| *b += g),
+                );
             }
             arch.dispatch(Descend { map: self.map, plane, branch, out });
         }

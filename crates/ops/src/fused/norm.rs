@@ -2,6 +2,11 @@
 
 use super::{Affine, CHANNELS, GradientSums, Plane};
 
+/// Groups of neighbouring channels of every normalisation.
+pub const GROUPS: usize = 16;
+/// Added to every (biased) variance.
+const EPSILON: f64 = 1e-5;
+
 /// Mean and reciprocal standard deviation of every group.
 pub type GroupStatistics = [Vec<f32>; 2];
 
@@ -12,10 +17,6 @@ pub type Linear = [[f32; CHANNELS]; 3];
 /// Group normalisation of one or two stacked planes.
 #[derive(Debug, Clone, Copy)]
 pub struct GroupNorm<'a> {
-    /// Groups of neighbouring channels.
-    pub groups: usize,
-    /// Added to the (biased) variance.
-    pub epsilon: f64,
     /// Factor per channel.
     pub gamma: &'a [f32],
     /// Summand per channel.
@@ -35,7 +36,7 @@ pub struct NormGradients {
 
 impl GroupNorm<'_> {
     fn per_group(&self) -> usize {
-        self.gamma.len() / self.groups
+        self.gamma.len() / GROUPS
     }
 
     /// Statistics of the stacked planes, from the planes' moments.
@@ -51,9 +52,9 @@ impl GroupNorm<'_> {
             let mean = members().map(|(mean, _)| mean).sum::<f64>() / per_group as f64;
             let squares: f64 = members().map(|(m, squares)| squares + count * (m - mean).powi(2)).sum();
             let variance = squares / (count * per_group as f64);
-            (mean as f32, (variance + self.epsilon).sqrt().recip() as f32)
+            (mean as f32, (variance + EPSILON).sqrt().recip() as f32)
         };
-        let (mean, rstd) = (0..self.groups).map(group).unzip();
+        let (mean, rstd) = (0..GROUPS).map(group).unzip();
         [mean, rstd]
     }
 
@@ -70,14 +71,13 @@ impl GroupNorm<'_> {
         (0..self.gamma.len() / CHANNELS).map(affine).collect()
     }
 
-    /// The backward pass from the sums over each plane's gradient. Measured statistics depend on the planes and add to
-    /// the planes' gradient. `frozen` statistics are constants.
+    /// The backward pass from the sums over each plane's gradient. Statistics depend on the planes and add to the
+    /// planes' gradient.
     pub fn backward(
         &self,
         [mean, rstd]: &GroupStatistics,
         planes: &[&Plane],
         sums: &[GradientSums],
-        frozen: bool,
     ) -> NormGradients {
         let per_group = self.per_group();
         let channels = self.gamma.len();
@@ -95,9 +95,8 @@ impl GroupNorm<'_> {
             let terms = (g * per_group..(g + 1) * per_group).map(|i| f64::from(self.gamma[i]) * values[i]);
             terms.sum::<f64>() / members
         };
-        let groups: Vec<[f64; 2]> = (0..self.groups)
-            .map(|g| if frozen { [0.0; 2] } else { [group_mean(&beta, g), group_mean(&gamma, g)] })
-            .collect();
+        let groups: Vec<[f64; 2]> =
+            (0..GROUPS).map(|g| [group_mean(&beta, g), group_mean(&gamma, g)]).collect();
         // ∂x = rstd·(γ·g − mean(γ·g) − x̂·mean(γ·g·x̂)) with x̂ = rstd·(x − mean).
         let map = |plane: usize| -> Linear {
             let coefficients: [[f32; 3]; CHANNELS] = std::array::from_fn(|c| {

@@ -3,12 +3,12 @@
 //! cache. The forward pass keeps nothing but the logarithm of every row's sum of exponentials. The backward pass
 //! computes the scores of each block of queries again (Dao, "FlashAttention-2"), so that scores never leave the cache.
 
-use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 use crate::buffers::{Floats, take};
 use crate::math::exp;
-use crate::multiply::{Matrix, Multiply, Right};
+use crate::multiply::{Matrix, Right, product};
+use crate::vectors::vectorized;
 
 /// Queries per block of the forward pass: 128 × 1024 scores of 4 bytes fit a second-level cache.
 const FORWARD_BLOCK: usize = 128;
@@ -21,16 +21,14 @@ const BLOCK: usize = 64;
 pub struct Attention {
     /// Samples.
     pub batch: usize,
-    /// Number of queries.
-    pub queries: usize,
-    /// Number of keys and values.
-    pub keys: usize,
+    /// Tokens of a sample: queries, keys and values.
+    pub tokens: usize,
     /// Heads.
     pub heads: usize,
     /// Channels of a head, a multiple of 4.
     pub head_dim: usize,
     /// Products in bf16, if the processor has the instructions.
-    pub half: bool,
+    pub in_bf16: bool,
 }
 
 /// Rotation tables cos and ±sin, `[tokens, head_dim]` each, as [`crate::Rope`] holds them.
@@ -57,86 +55,84 @@ impl<'a> Tokens<'a> {
 }
 
 impl Attention {
-    /// softmax(rotated q · rotated kᵀ / √head_dim) · v: queries `[B, queries, C]`, keys and values `[B, keys, C]` →
-    /// `[B, queries, C]`, and the logarithms of the rows' sums of exponentials, `[B, heads, queries]`.
+    /// softmax(rotated q · rotated kᵀ / √head_dim) · v of queries, keys and values `[B, tokens, C]` → `[B, tokens, C]`,
+    /// and the logarithms of the rows' sums of exponentials, `[B, heads, tokens]`.
     pub fn forward(&self, [q, k, v]: [Tokens; 3], rope: Tables) -> (Vec<f32>, Vec<f32>) {
-        let Self { queries, keys, head_dim: d, .. } = *self;
-        let arch = Arch::new();
-        let mut by_head = Floats::new(self.batch * queries * self.heads * d);
-        let mut logarithms = vec![0.0; self.batch * self.heads * queries];
-        let heads = by_head.par_chunks_exact_mut(queries * d).zip(logarithms.par_chunks_exact_mut(queries));
+        let Self { tokens, head_dim: d, .. } = *self;
+        let mut by_head = Floats::new(self.batch * tokens * self.heads * d);
+        let mut logarithms = vec![0.0; self.batch * self.heads * tokens];
+        let heads = by_head.par_chunks_exact_mut(tokens * d).zip(logarithms.par_chunks_exact_mut(tokens));
         heads.enumerate().for_each(|(i, (out, logarithms))| {
-            let [packed_q, packed_k] = [(q, queries, self.scale()), (k, keys, 1.0)]
-                .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor));
-            let across = self.right([d, keys], (&packed_k, [d, 1]));
-            let values = self.right([keys, d], (self.head(v, keys, i), [1, v.width]));
-            let mut scores = Floats::new(FORWARD_BLOCK.min(queries) * keys);
+            let [packed_q, packed_k] =
+                [(q, self.scale()), (k, 1.0)].map(|(x, factor)| self.pack(x, i, rope, factor));
+            let across = self.right([d, tokens], (&packed_k, [d, 1]));
+            let values = self.right([tokens, d], (self.head(v, i), [1, v.width]));
+            let mut scores = Floats::new(FORWARD_BLOCK.min(tokens) * tokens);
             let blocks = packed_q.chunks(FORWARD_BLOCK * d).zip(out.chunks_mut(FORWARD_BLOCK * d));
             for ((block, out), logarithms) in blocks.zip(logarithms.chunks_mut(FORWARD_BLOCK)) {
                 let rows = logarithms.len();
-                let scores = &mut scores[..rows * keys];
-                product([rows, keys, d], (block, [1, d]), &across, scores, false);
-                let sums = arch.dispatch(Exponentials { scores, keys, logarithms });
-                product([rows, d, keys], (scores, [1, keys]), &values, out, false);
+                let scores = &mut scores[..rows * tokens];
+                product([rows, tokens, d], (block, [1, d]), &across, scores, false);
+                let sums = exponentials(scores, tokens, logarithms);
+                product([rows, d, tokens], (scores, [1, tokens]), &values, out, false);
                 for (row, sum) in out.chunks_exact_mut(d).zip(sums) {
                     row.iter_mut().for_each(|x| *x /= sum);
                 }
             }
         });
-        (self.by_token([&by_head], queries), logarithms)
+        (self.by_token([&by_head]), logarithms)
     }
 
-    /// Gradients of queries, keys and values from the output's gradient `dy` `[B, queries, C]`. One function computes
+    /// Gradients of queries, keys and values from the output's gradient `dy` `[B, tokens, C]`. One function computes
     /// all three, because they share nearly all of the work.
     pub fn backward(&self, qkv: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> [Vec<f32>; 3] {
-        let by_head = self.by_head(qkv, rope, logarithms, dy);
-        let tokens = [self.queries, self.keys, self.keys];
-        [0, 1, 2].map(|i| self.by_token([&by_head[i]], tokens[i]))
+        self.by_head(qkv, rope, logarithms, dy).map(|values| self.by_token([&values]))
     }
 
     /// [`Attention::backward`] with the three gradients in one tensor `[B, tokens, 3·C]`.
     pub fn backward_parts(&self, qkv: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> Vec<f32> {
         let by_head = self.by_head(qkv, rope, logarithms, dy);
-        self.by_token(by_head.each_ref().map(|values| &values[..]), self.queries)
+        self.by_token(by_head.each_ref().map(|values| &values[..]))
     }
 
     /// Gradients of queries, keys and values, `[B, heads, tokens, head_dim]`.
     fn by_head(&self, [q, k, v]: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> [Floats; 3] {
-        let Self { queries, keys, head_dim: d, .. } = *self;
-        let (arch, width) = (Arch::new(), self.heads * d);
-        let mut by_head = [queries, keys, keys].map(|tokens| Floats::new(self.batch * tokens * width));
+        let Self { tokens, head_dim: d, .. } = *self;
+        let width = self.heads * d;
+        let mut by_head = [(); 3].map(|()| Floats::new(self.batch * tokens * width));
         let [dq, dk, dv] = &mut by_head;
-        let heads = dq.par_chunks_exact_mut(queries * d).zip(dk.par_chunks_exact_mut(keys * d));
-        let heads = heads.zip(dv.par_chunks_exact_mut(keys * d)).enumerate();
+        let heads = dq.par_chunks_exact_mut(tokens * d).zip(dk.par_chunks_exact_mut(tokens * d));
+        let heads = heads.zip(dv.par_chunks_exact_mut(tokens * d)).enumerate();
         heads.for_each(|(i, ((dq, dk), dv))| {
-            let [packed_q, packed_k] = [(q, queries, self.scale()), (k, keys, 1.0)]
-                .map(|(x, tokens, factor)| self.pack(x, tokens, i, rope, factor));
-            let (values, dy) = (self.head(v, keys, i), self.head(Tokens { values: dy, width }, queries, i));
-            let across = [(&packed_k[..], [d, 1]), (values, [v.width, 1])].map(|x| self.right([d, keys], x));
-            let along = self.right([keys, d], (&packed_k, [1, d]));
-            let [mut scores, mut gradients] = [(); 2].map(|()| Floats::new(BLOCK.min(queries) * keys));
+            let [packed_q, packed_k] =
+                [(q, self.scale()), (k, 1.0)].map(|(x, factor)| self.pack(x, i, rope, factor));
+            let (values, dy) = (self.head(v, i), self.head(Tokens { values: dy, width }, i));
+            let across =
+                [(&packed_k[..], [d, 1]), (values, [v.width, 1])].map(|x| self.right([d, tokens], x));
+            let along = self.right([tokens, d], (&packed_k, [1, d]));
+            let [mut scores, mut gradients] = [(); 2].map(|()| Floats::new(BLOCK.min(tokens) * tokens));
             let blocks = packed_q.chunks(BLOCK * d).zip(dq.chunks_mut(BLOCK * d));
-            let logarithms = logarithms[i * queries..][..queries].chunks(BLOCK);
+            let logarithms = logarithms[i * tokens..][..tokens].chunks(BLOCK);
             for (b, ((block, dq), logarithms)) in blocks.zip(logarithms).enumerate() {
                 let (rows, add) = (logarithms.len(), b > 0);
                 let dy = (&dy[b * BLOCK * width..], [1, width]);
                 let of_block = [(block, [1, d]), dy].map(|x| self.right([rows, d], x));
-                let (scores, gradients) = (&mut scores[..rows * keys], &mut gradients[..rows * keys]);
-                product([rows, keys, d], (block, [1, d]), &across[0], scores, false);
-                product([rows, keys, d], dy, &across[1], gradients, false);
-                arch.dispatch(Backward { scores, gradients, keys, logarithms });
-                product([rows, d, keys], (gradients, [1, keys]), &along, dq, false);
-                product([keys, d, rows], (gradients, [keys, 1]), &of_block[0], dk, add);
-                product([keys, d, rows], (scores, [keys, 1]), &of_block[1], dv, add);
+                let (scores, gradients) = (&mut scores[..rows * tokens], &mut gradients[..rows * tokens]);
+                product([rows, tokens, d], (block, [1, d]), &across[0], scores, false);
+                product([rows, tokens, d], dy, &across[1], gradients, false);
+                softmax_gradient(scores, gradients, tokens, logarithms);
+                product([rows, d, tokens], (gradients, [1, tokens]), &along, dq, false);
+                product([tokens, d, rows], (gradients, [tokens, 1]), &of_block[0], dk, add);
+                product([tokens, d, rows], (scores, [tokens, 1]), &of_block[1], dv, add);
             }
-            arch.dispatch(Unrotate { x: dq, d, rope, factor: self.scale() });
-            arch.dispatch(Unrotate { x: dk, d, rope, factor: 1.0 });
+            unrotate(dq, d, rope, self.scale());
+            unrotate(dk, d, rope, 1.0);
         });
         by_head
     }
 
     fn right<'a>(&self, size: [usize; 2], matrix: Matrix<'a>) -> Right<'a> {
-        Right::new(self.half, size, matrix)
+        Right::new(self.in_bf16, size, matrix)
     }
 
     fn scale(&self) -> f32 {
@@ -144,24 +140,23 @@ impl Attention {
     }
 
     /// The values from the first token of a head on; `i` counts the heads of all samples.
-    fn head<'a>(&self, x: Tokens<'a>, tokens: usize, i: usize) -> &'a [f32] {
-        &x.values[i / self.heads * tokens * x.width + i % self.heads * self.head_dim..]
+    fn head<'a>(&self, x: Tokens<'a>, i: usize) -> &'a [f32] {
+        &x.values[i / self.heads * self.tokens * x.width + i % self.heads * self.head_dim..]
     }
 
     /// The tokens `[tokens, head_dim]` of head `i`, rotated and multiplied by `factor`.
-    fn pack(&self, x: Tokens, tokens: usize, i: usize, rope: Tables, factor: f32) -> Floats {
-        let (d, width) = (self.head_dim, x.width);
-        let mut out = Floats::new(tokens * d);
-        let x = self.head(x, tokens, i);
-        Arch::new().dispatch(Rotate { x, width, d, rope, factor, out: &mut out });
+    fn pack(&self, x: Tokens, i: usize, rope: Tables, factor: f32) -> Floats {
+        let mut out = Floats::new(self.tokens * self.head_dim);
+        rotate(self.head(x, i), x.width, self.head_dim, rope, factor, &mut out);
         out
     }
 
     /// Parts `[B, heads, tokens, head_dim]` → `[B, tokens, parts·C]`.
-    fn by_token<const PARTS: usize>(&self, parts: [&[f32]; PARTS], tokens: usize) -> Vec<f32> {
+    fn by_token<const PARTS: usize>(&self, parts: [&[f32]; PARTS]) -> Vec<f32> {
         /// Tokens per task.
         const TOKENS: usize = 64;
-        let (d, width) = (self.head_dim, self.heads * self.head_dim);
+        let Self { tokens, head_dim: d, .. } = *self;
+        let width = self.heads * d;
         let mut out = take(PARTS * self.batch * tokens * width);
         out.par_chunks_mut(TOKENS * PARTS * width).enumerate().for_each(|(i, out)| {
             for (j, out) in out.chunks_exact_mut(PARTS * width).enumerate() {
@@ -177,151 +172,117 @@ impl Attention {
     }
 }
 
-/// A matrix product into contiguous rows.
-fn product(size: [usize; 3], lhs: Matrix, rhs: &Right, out: &mut [f32], add: bool) {
-    Multiply { size, lhs, rhs, add }.write(out, size[1]);
-}
-
-/// Rotates, scales and packs one head's tokens.
-struct Rotate<'a> {
-    x: &'a [f32],
-    width: usize,
-    d: usize,
-    rope: Tables<'a>,
-    factor: f32,
-    out: &'a mut [f32],
-}
-
-impl WithSimd for Rotate<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let (d, quarter) = (self.d, self.d / 4);
-        for (token, out) in self.out.chunks_exact_mut(d).enumerate() {
-            let x = &self.x[token * self.width..][..d];
-            let (cos, sin) = (&self.rope[0][token * d..][..d], &self.rope[1][token * d..][..d]);
-            // Two halves (row, column). The two quarters of a half hold the members of its pairs.
-            for half in [0, 2 * quarter] {
-                let [x, cos, sin] =
-                    [x, cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
-                let (first, second) = out[half..half + 2 * quarter].split_at_mut(quarter);
-                for k in 0..quarter {
-                    first[k] = (x.0[k] * cos.0[k] + x.1[k] * sin.0[k]) * self.factor;
-                    second[k] = (x.1[k] * cos.1[k] + x.0[k] * sin.1[k]) * self.factor;
+/// Rotates, scales and packs one head's tokens, which begin `width` floats apart.
+fn rotate(x: &[f32], width: usize, d: usize, rope: Tables, factor: f32, out: &mut [f32]) {
+    let quarter = d / 4;
+    vectorized(
+        #[inline(always)]
+        move || {
+            for (token, out) in out.chunks_exact_mut(d).enumerate() {
+                let x = &x[token * width..][..d];
+                let (cos, sin) = (&rope[0][token * d..][..d], &rope[1][token * d..][..d]);
+                // Two halves (row, column). The two quarters of a half hold the members of its pairs.
+                for half in [0, 2 * quarter] {
+                    let [x, cos, sin] =
+                        [x, cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
+                    let (first, second) = out[half..half + 2 * quarter].split_at_mut(quarter);
+                    for k in 0..quarter {
+                        first[k] = (x.0[k] * cos.0[k] + x.1[k] * sin.0[k]) * factor;
+                        second[k] = (x.1[k] * cos.1[k] + x.0[k] * sin.1[k]) * factor;
+                    }
                 }
             }
-        }
-    }
+        },
+    );
 }
 
 /// Rotates the gradients of rotated tokens back, in place, and scales them.
-struct Unrotate<'a> {
-    x: &'a mut [f32],
-    d: usize,
-    rope: Tables<'a>,
-    factor: f32,
-}
-
-impl WithSimd for Unrotate<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let (d, quarter) = (self.d, self.d / 4);
-        let tables = self.rope[0].chunks_exact(d).zip(self.rope[1].chunks_exact(d));
-        for (x, (cos, sin)) in self.x.chunks_exact_mut(d).zip(tables) {
-            for half in [0, 2 * quarter] {
-                let [cos, sin] = [cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
-                let (first, second) = x[half..half + 2 * quarter].split_at_mut(quarter);
-                for k in 0..quarter {
-                    let (a, b) = (first[k] * self.factor, second[k] * self.factor);
-                    first[k] = a * cos.0[k] + b * sin.1[k];
-                    second[k] = b * cos.1[k] + a * sin.0[k];
+fn unrotate(x: &mut [f32], d: usize, rope: Tables, factor: f32) {
+    let quarter = d / 4;
+    vectorized(
+        #[inline(always)]
+        move || {
+            let tables = rope[0].chunks_exact(d).zip(rope[1].chunks_exact(d));
+            for (x, (cos, sin)) in x.chunks_exact_mut(d).zip(tables) {
+                for half in [0, 2 * quarter] {
+                    let [cos, sin] =
+                        [cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
+                    let (first, second) = x[half..half + 2 * quarter].split_at_mut(quarter);
+                    for k in 0..quarter {
+                        let (a, b) = (first[k] * factor, second[k] * factor);
+                        first[k] = a * cos.0[k] + b * sin.1[k];
+                        second[k] = b * cos.1[k] + a * sin.0[k];
+                    }
                 }
             }
-        }
-    }
+        },
+    );
 }
 
 /// Independent accumulators of a reduction, as many as the widest vector has lanes.
 const LANES: usize = 16;
 
 /// Replaces scores by e^(score − row's maximum), and writes ln Σ e^score per row. Returns the sums of the new rows.
-struct Exponentials<'a> {
-    scores: &'a mut [f32],
-    keys: usize,
-    logarithms: &'a mut [f32],
-}
-
-impl WithSimd for Exponentials<'_> {
-    type Output = Vec<f32>;
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) -> Vec<f32> {
-        // Loops, because closures are not compiled for the target's features.
-        let mut all = Vec::with_capacity(self.logarithms.len());
-        for (row, logarithm) in self.scores.chunks_exact_mut(self.keys).zip(self.logarithms) {
-            let mut most = [f32::NEG_INFINITY; LANES];
-            let (chunks, rest) = row.as_chunks::<LANES>();
-            for chunk in chunks {
-                for (m, x) in most.iter_mut().zip(chunk) {
-                    *m = if *x > *m { *x } else { *m };
+fn exponentials(scores: &mut [f32], keys: usize, logarithms: &mut [f32]) -> Vec<f32> {
+    vectorized(
+        #[inline(always)]
+        move || {
+            let mut all = Vec::with_capacity(logarithms.len());
+            for (row, logarithm) in scores.chunks_exact_mut(keys).zip(logarithms.iter_mut()) {
+                let mut most = [f32::NEG_INFINITY; LANES];
+                let (chunks, rest) = row.as_chunks::<LANES>();
+                for chunk in chunks {
+                    for (m, x) in most.iter_mut().zip(chunk) {
+                        *m = if *x > *m { *x } else { *m };
+                    }
                 }
-            }
-            let most = most.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max);
-            let mut sums = [0.0_f32; LANES];
-            let (chunks, rest) = row.as_chunks_mut::<LANES>();
-            for chunk in chunks {
-                for (s, x) in sums.iter_mut().zip(chunk) {
+                let most = most.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max);
+                let mut sums = [0.0_f32; LANES];
+                let (chunks, rest) = row.as_chunks_mut::<LANES>();
+                for chunk in chunks {
+                    for (s, x) in sums.iter_mut().zip(chunk) {
+                        *x = exp(*x - most);
+                        *s += *x;
+                    }
+                }
+                let mut sum: f32 = sums.iter().sum();
+                for x in rest {
                     *x = exp(*x - most);
-                    *s += *x;
+                    sum += *x;
                 }
+                *logarithm = most + sum.ln();
+                all.push(sum);
             }
-            let mut sum: f32 = sums.iter().sum();
-            for x in rest {
-                *x = exp(*x - most);
-                sum += *x;
-            }
-            *logarithm = most + sum.ln();
-            all.push(sum);
-        }
-        all
-    }
+            all
+        },
+    )
 }
 
 /// Replaces scores by their softmax p, and the gradient dp by the gradient of the scores, p · (dp − Σ p·dp).
-struct Backward<'a> {
-    scores: &'a mut [f32],
-    gradients: &'a mut [f32],
-    keys: usize,
-    logarithms: &'a [f32],
-}
-
-impl WithSimd for Backward<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let rows = self.scores.chunks_exact_mut(self.keys).zip(self.gradients.chunks_exact_mut(self.keys));
-        for ((scores, gradients), logarithm) in rows.zip(self.logarithms) {
-            let mut sums = [0.0_f32; LANES];
-            let (chunks, rest) = scores.as_chunks_mut::<LANES>();
-            let (given, given_rest) = gradients.as_chunks::<LANES>();
-            for (chunk, given) in chunks.iter_mut().zip(given) {
-                for ((s, x), g) in sums.iter_mut().zip(chunk).zip(given) {
+fn softmax_gradient(scores: &mut [f32], gradients: &mut [f32], keys: usize, logarithms: &[f32]) {
+    vectorized(
+        #[inline(always)]
+        move || {
+            let rows = scores.chunks_exact_mut(keys).zip(gradients.chunks_exact_mut(keys));
+            for ((scores, gradients), logarithm) in rows.zip(logarithms) {
+                let mut sums = [0.0_f32; LANES];
+                let (chunks, rest) = scores.as_chunks_mut::<LANES>();
+                let (given, given_rest) = gradients.as_chunks::<LANES>();
+                for (chunk, given) in chunks.iter_mut().zip(given) {
+                    for ((s, x), g) in sums.iter_mut().zip(chunk).zip(given) {
+                        *x = exp(*x - logarithm);
+                        *s += *x * g;
+                    }
+                }
+                let mut sum: f32 = sums.iter().sum();
+                for (x, g) in rest.iter_mut().zip(given_rest) {
                     *x = exp(*x - logarithm);
-                    *s += *x * g;
+                    sum += *x * g;
+                }
+                for (g, p) in gradients.iter_mut().zip(scores) {
+                    *g = *p * (*g - sum);
                 }
             }
-            let mut sum: f32 = sums.iter().sum();
-            for (x, g) in rest.iter_mut().zip(given_rest) {
-                *x = exp(*x - logarithm);
-                sum += *x * g;
-            }
-            for (g, p) in gradients.iter_mut().zip(scores) {
-                *g = *p * (*g - sum);
-            }
-        }
-    }
+        },
+    );
 }

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::elements::{add_constant, mask, rectify, total};
 use super::{Gradients, Layer, Wanted, join};
 use crate::buffers::{Floats, take};
-use crate::multiply::{Multiply, Right};
+use crate::multiply::{Right, product};
 use crate::winograd::pieces;
 
 /// Floats of a block's inputs and outputs: 128 KiB.
@@ -28,7 +28,7 @@ pub struct Conv1x1 {
     /// Reads max(x, 0).
     pub rectified: bool,
     /// Products in bf16, if the processor has the instructions.
-    pub half: bool,
+    pub in_bf16: bool,
 }
 
 /// Some pixels of one image, and the slices for their results, channel by channel.
@@ -50,9 +50,8 @@ impl Layer for Conv1x1 {
             let (n, x) = (block.count, &x[block.image * inputs * pixels + block.first..]);
             let mut read = Floats::new(if self.rectified { inputs * n } else { 0 });
             let mut results = Floats::new(outputs * n);
-            let x = Right::new(self.half, [inputs, n], self.read(x, n, &mut read));
-            Multiply { size: [outputs, n, inputs], lhs: (weight, [1, inputs]), rhs: &x, add: false }
-                .write(&mut results, n);
+            let x = Right::new(self.in_bf16, [inputs, n], self.read(x, n, &mut read));
+            product([outputs, n, inputs], (weight, [1, inputs]), &x, &mut results, false);
             for (c, (out, results)) in block.out.into_iter().zip(results.chunks_exact(n)).enumerate() {
                 let bias = bias.map_or(0.0, |bias| bias[c]);
                 add_constant(results, bias, out);
@@ -100,7 +99,7 @@ impl Conv1x1 {
                 let mut read = Floats::new(if rectified { inputs * n } else { 0 });
                 let (x, [_, stride]) = self.read(&x[*first..], n, &mut read);
                 let (lhs, rhs) = ((&dy[*first..], [1, pixels]), Right::Plain((x, [stride, 1])));
-                Multiply { size: [outputs, inputs, n], lhs, rhs: &rhs, add }.write(&mut weights, inputs);
+                product([outputs, inputs, n], lhs, &rhs, &mut weights, add);
                 add = true;
             }
             if wanted.bias {
@@ -111,8 +110,7 @@ impl Conv1x1 {
             if wanted.input {
                 let mut results = Floats::new(inputs * n);
                 let rhs = &Right::Plain((&dy[*first..], [1, pixels]));
-                Multiply { size: [inputs, n, outputs], lhs: (weight, [inputs, 1]), rhs, add: false }
-                    .write(&mut results, n);
+                product([inputs, n, outputs], (weight, [inputs, 1]), rhs, &mut results, false);
                 let channels = out.iter_mut().zip(results.chunks_exact(n)).zip(x.chunks_exact(pixels));
                 for ((out, results), x) in channels {
                     out.copy_from_slice(results);

@@ -17,7 +17,7 @@ use super::{Gradients, Layer, Unfolded, Wanted};
 use crate::buffers::{Floats, take};
 use crate::winograd::planes::{Planes, Scatter, Transposer};
 use crate::winograd::product::{Left, PANEL, Panels, Product};
-use crate::winograd::transforms::{Block, Filters, Inputs, Outputs, POINTS, TILE, lines};
+use crate::winograd::transforms::{self, Block, Inputs, Outputs, POINTS, TILE, lines};
 use crate::winograd::{GROUP, pieces};
 
 /// Floats of a block's transformed inputs and products together: 1 MiB, most of which fits a second-level cache.
@@ -82,11 +82,10 @@ impl Conv3x3 {
     fn transformed(&self, weight: &[f32], strides: [usize; 2], turned: bool) -> Floats {
         let panel = POINTS * self.inputs.next_multiple_of(GROUP) * PANEL;
         let mut filters = Floats::new(self.outputs.div_ceil(PANEL) * panel);
-        let arch = Arch::new();
         filters.par_chunks_exact_mut(panel).enumerate().for_each(|(i, out)| {
             let weights = &weight[i * PANEL * strides[0]..];
             let outputs = PANEL.min(self.outputs - i * PANEL);
-            arch.dispatch(Filters { weights, outputs, inputs: self.inputs, strides, turned, out });
+            transforms::filters(weights, [outputs, self.inputs], strides, turned, out);
         });
         filters
     }

@@ -1,12 +1,13 @@
 //! Element-wise operations in vector instructions. (Plain loops compile to branches here, which are ten times as slow
 //! for random signs.)
 
-use pulp::Arch;
 use rayon::prelude::*;
+
+use crate::vectors::vectorized;
 
 /// out = max(x, 0).
 pub fn rectify(x: &[f32], out: &mut [f32]) {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || out.iter_mut().zip(x).for_each(|(out, x)| *out = if *x > 0.0 { *x } else { 0.0 }),
     );
@@ -14,7 +15,7 @@ pub fn rectify(x: &[f32], out: &mut [f32]) {
 
 /// gradient = 0 where x is not positive.
 pub fn mask(x: &[f32], gradient: &mut [f32]) {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || {
             for (gradient, x) in gradient.iter_mut().zip(x) {
@@ -26,7 +27,7 @@ pub fn mask(x: &[f32], gradient: &mut [f32]) {
 
 /// out = x + y.
 pub fn add_constant(x: &[f32], y: f32, out: &mut [f32]) {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || out.iter_mut().zip(x).for_each(|(out, x)| *out = x + y),
     );
@@ -34,7 +35,7 @@ pub fn add_constant(x: &[f32], y: f32, out: &mut [f32]) {
 
 /// Adds every row to `sums`.
 pub fn add_rows(rows: &[f32], sums: &mut [f32]) {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || {
             for row in rows.chunks_exact(sums.len()) {
@@ -46,7 +47,7 @@ pub fn add_rows(rows: &[f32], sums: &mut [f32]) {
 
 /// Adds `row` to every row.
 pub fn add_to_rows(row: &[f32], rows: &mut [f32]) {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || {
             for out in rows.chunks_exact_mut(row.len()) {
@@ -58,7 +59,7 @@ pub fn add_to_rows(row: &[f32], rows: &mut [f32]) {
 
 /// The sum of the values, as sixteen interleaved sums.
 pub fn total(values: &[f32]) -> f32 {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || {
             let (chunks, rest) = values.as_chunks::<16>();

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use super::elements::{add_constant, channel_sums, mask, rectify};
 use super::{Gradients, Layer, Wanted};
 use crate::buffers::{Floats, take};
-use crate::multiply::{Multiply, Right};
+use crate::multiply::{Right, product};
 use crate::winograd::pieces;
 
 /// Taps of a filter.
@@ -63,7 +63,7 @@ impl Layer for Unfolded {
             let mut results = Floats::new(outputs * n);
             let lhs = (weight, [1, inputs * TAPS]);
             let rhs = Right::Plain((&taps, [1, n]));
-            Multiply { size: [outputs, n, inputs * TAPS], lhs, rhs: &rhs, add: false }.write(&mut results, n);
+            product([outputs, n, inputs * TAPS], lhs, &rhs, &mut results, false);
             for (c, (out, results)) in out.into_iter().zip(results.chunks_exact(n)).enumerate() {
                 add_constant(results, bias.map_or(0.0, |bias| bias[c]), out);
             }
@@ -94,13 +94,12 @@ impl Layer for Unfolded {
                 if wanted.weight {
                     self.unfold(x, 0, &mut taps);
                     let rhs = &Right::Plain((&taps, [n, 1]));
-                    Multiply { size: [outputs, width, n], lhs: (dy, [1, n]), rhs, add: image > 0 }
-                        .write(&mut sums, width);
+                    product([outputs, width, n], (dy, [1, n]), rhs, &mut sums, image > 0);
                 }
                 if let Some(dx) = dx.get_mut(image) {
                     let lhs = (&weight[first * TAPS..], [inputs * TAPS, 1]);
                     let rhs = &Right::Plain((dy, [1, n]));
-                    Multiply { size: [width, n, outputs], lhs, rhs, add: false }.write(&mut taps, n);
+                    product([width, n, outputs], lhs, rhs, &mut taps, false);
                     self.fold(&taps, dx);
                     if self.rectified {
                         mask(x, dx);

@@ -1,14 +1,14 @@
 //! Linear layers, alone or followed by GELU: one matrix product per block of rows. Bias, GELU and their gradients are
 //! computed while the block is in the cache.
 
-use pulp::Arch;
 use rayon::prelude::*;
 
 use super::elements::{add_rows, add_to_rows};
 use super::{Gradients, Layer, Wanted, join, parts};
 use crate::buffers::{Floats, take};
 use crate::math::{gelu, gelu_derivative};
-use crate::multiply::{Multiply, Right};
+use crate::multiply::{Right, product};
+use crate::vectors::vectorized;
 
 /// Rows per task of the products over rows.
 const ROWS: usize = 128;
@@ -29,7 +29,7 @@ pub struct Linear {
     /// The weight is `[outputs, inputs]`, as in a convolution, instead of `[inputs, outputs]`.
     pub transposed: bool,
     /// Products in bf16, if the processor has the instructions.
-    pub half: bool,
+    pub in_bf16: bool,
     /// GELU (erf form) follows.
     pub gelu: bool,
 }
@@ -48,21 +48,21 @@ impl Layer for Linear {
     ) -> (Vec<f32>, Option<Floats>) {
         let (size, piece) = (self.rows * self.outputs, ROWS * self.outputs);
         let (mut out, mut before) = (take(size), (self.gelu && keep).then(|| Floats::new(size)));
-        let (arch, weight) = (Arch::new(), self.factor(weight));
+        let weight = self.factor(weight);
         let kept = parts(before.as_deref_mut(), piece, self.rows.div_ceil(ROWS));
         let tasks = out.par_chunks_mut(piece).zip(x.par_chunks(ROWS * self.inputs));
         tasks.zip(kept).for_each(|((out, x), before)| match before {
             Some(before) => {
                 self.product(x, &weight, bias, before);
-                arch.dispatch(
+                vectorized(
                     #[inline(always)]
-                    || out.iter_mut().zip(before).for_each(|(out, z)| *out = gelu(*z)),
+                    || out.iter_mut().zip(before.iter()).for_each(|(out, z)| *out = gelu(*z)),
                 );
             }
             None => {
                 self.product(x, &weight, bias, out);
                 if self.gelu {
-                    arch.dispatch(
+                    vectorized(
                         #[inline(always)]
                         || out.iter_mut().for_each(|out| *out = gelu(*out)),
                     );
@@ -107,7 +107,7 @@ impl Layer for Linear {
             }
             if let Some((dx, rhs)) = dx.zip(transposed.as_ref()) {
                 let size = [dz.len() / outputs, inputs, outputs];
-                Multiply { size, lhs: (dz, [1, outputs]), rhs, add: false }.write(dx, inputs);
+                product(size, (dz, [1, outputs]), rhs, dx, false);
             }
         });
         let weight = wanted.weight.then(|| self.weight_gradient(x, dz.as_deref().unwrap_or(dy)));
@@ -127,7 +127,7 @@ impl Linear {
         out.par_chunks_mut(block * columns).enumerate().for_each(|(i, out)| {
             let size = [out.len() / columns, columns, self.rows];
             let lhs = (&left[i * block..], [rows, 1]);
-            Multiply { size, lhs, rhs, add: false }.write(out, columns);
+            product(size, lhs, rhs, out, false);
         });
         out
     }
@@ -139,12 +139,12 @@ impl Linear {
 
     /// The weight as the right factor.
     fn factor<'a>(&self, weight: &'a [f32]) -> Right<'a> {
-        Right::new(self.half, [self.inputs, self.outputs], (weight, self.strides()))
+        Right::new(self.in_bf16, [self.inputs, self.outputs], (weight, self.strides()))
     }
 
     fn product(&self, x: &[f32], rhs: &Right, bias: Option<&[f32]>, out: &mut [f32]) {
         let (size, lhs) = ([x.len() / self.inputs, self.outputs, self.inputs], (x, [1, self.inputs]));
-        Multiply { size, lhs, rhs, add: false }.write(out, self.outputs);
+        product(size, lhs, rhs, out, false);
         if let Some(bias) = bias {
             add_to_rows(bias, out);
         }
@@ -153,7 +153,7 @@ impl Linear {
 
 /// dz = dy · gelu'(z).
 fn derive(z: &[f32], dy: &[f32], dz: &mut [f32]) {
-    Arch::new().dispatch(
+    vectorized(
         #[inline(always)]
         || {
             for ((dz, z), dy) in dz.iter_mut().zip(z).zip(dy) {

@@ -1,10 +1,10 @@
 //! Layer normalisation, forward and backward.
 
-use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::{Gradients, Layer, Wanted, join, parts};
 use crate::buffers::take;
+use crate::vectors::vectorized;
 
 /// Rows per task.
 const ROWS: usize = 64;
@@ -37,11 +37,9 @@ impl Layer for LayerNorm {
         let bias = bias.expect("the published norms have biases");
         let mut out = take(x.len());
         let mut statistics = vec![[0.0; 2]; x.len() / self.channels];
-        let (arch, piece) = (Arch::new(), ROWS * self.channels);
+        let piece = ROWS * self.channels;
         let tasks = out.par_chunks_mut(piece).zip(x.par_chunks(piece)).zip(statistics.par_chunks_mut(ROWS));
-        tasks.for_each(|((out, x), statistics)| {
-            arch.dispatch(Forward { norm: self, x, weight, bias, out, statistics });
-        });
+        tasks.for_each(|((out, x), statistics)| self.normalise(x, [weight, bias], out, statistics));
         (out, statistics)
     }
 
@@ -56,7 +54,7 @@ impl Layer for LayerNorm {
         wanted: Wanted,
     ) -> Gradients {
         let (c, piece) = (self.channels, ROWS * self.channels);
-        let (arch, blocks) = (Arch::new(), statistics.len().div_ceil(ROWS));
+        let blocks = statistics.len().div_ceil(ROWS);
         let summed = wanted.weight || wanted.bias;
         let mut sums = vec![0.0; if summed { 2 * blocks * c } else { 0 }];
         let mut dx = wanted.input.then(|| take(x.len()));
@@ -65,11 +63,10 @@ impl Layer for LayerNorm {
         let given = x.par_chunks(piece).zip(dy.par_chunks(piece)).zip(statistics.par_chunks(ROWS));
         results.zip(totals).zip(given).for_each(|((dx, sums), ((x, dy), statistics))| {
             if let Some(sums) = sums {
-                let (weight, bias) = sums.split_at_mut(c);
-                arch.dispatch(ColumnSums { x, dy, statistics, weight, bias });
+                column_sums(x, dy, statistics, sums.split_at_mut(c));
             }
             if let Some(dx) = dx {
-                arch.dispatch(Backward { x, dy, weight, statistics, dx });
+                derive(x, dy, weight, statistics, dx);
             }
         });
         let mut joined = join(sums.chunks_exact(2 * c), 2 * c);
@@ -95,81 +92,64 @@ fn sum<const N: usize>(slices: [&[f32]; N], f: impl Fn([f32; N]) -> f32) -> f32 
     sums.into_iter().sum::<f32>() + rest.sum::<f32>()
 }
 
-struct Forward<'a> {
-    norm: &'a LayerNorm,
-    x: &'a [f32],
-    weight: &'a [f32],
-    bias: &'a [f32],
-    out: &'a mut [f32],
-    statistics: &'a mut [Statistics],
-}
-
-impl WithSimd for Forward<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let c = self.norm.channels;
-        let rows = self.x.chunks_exact(c).zip(self.out.chunks_exact_mut(c)).zip(self.statistics);
-        for ((x, out), statistics) in rows {
-            let mean = sum([x], |[x]| x) / c as f32;
-            let variance = sum([x], |[x]| (x - mean) * (x - mean)) / c as f32;
-            let scale = 1.0 / (variance + self.norm.epsilon).sqrt();
-            *statistics = [mean, scale];
-            for (((out, x), w), b) in out.iter_mut().zip(x).zip(self.weight).zip(self.bias) {
-                *out = (x - mean) * scale * w + b;
-            }
-        }
+impl LayerNorm {
+    /// Normalises rows, and writes their statistics.
+    fn normalise(
+        self,
+        x: &[f32],
+        [weight, bias]: [&[f32]; 2],
+        out: &mut [f32],
+        statistics: &mut [Statistics],
+    ) {
+        let c = self.channels;
+        vectorized(
+            #[inline(always)]
+            move || {
+                let rows = x.chunks_exact(c).zip(out.chunks_exact_mut(c)).zip(statistics.iter_mut());
+                for ((x, out), statistics) in rows {
+                    let mean = sum([x], |[x]| x) / c as f32;
+                    let variance = sum([x], |[x]| (x - mean) * (x - mean)) / c as f32;
+                    let scale = 1.0 / (variance + self.epsilon).sqrt();
+                    *statistics = [mean, scale];
+                    for (((out, x), w), b) in out.iter_mut().zip(x).zip(weight).zip(bias) {
+                        *out = (x - mean) * scale * w + b;
+                    }
+                }
+            },
+        );
     }
 }
 
 /// dx = scale · (g − mean(g) − h · mean(g·h)), with the normalised row h and g = dy·weight.
-struct Backward<'a> {
-    x: &'a [f32],
-    dy: &'a [f32],
-    weight: &'a [f32],
-    statistics: &'a [Statistics],
-    dx: &'a mut [f32],
-}
-
-impl WithSimd for Backward<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let c = self.weight.len();
-        let rows = self.x.chunks_exact(c).zip(self.dy.chunks_exact(c)).zip(self.dx.chunks_exact_mut(c));
-        for (((x, dy), dx), &[mean, scale]) in rows.zip(self.statistics) {
-            let constant = sum([dy, self.weight], |[dy, w]| dy * w) / c as f32;
-            let slope = sum([dy, self.weight, x], |[dy, w, x]| dy * w * ((x - mean) * scale)) / c as f32;
-            for (((dx, x), dy), w) in dx.iter_mut().zip(x).zip(dy).zip(self.weight) {
-                *dx = (dy * w - constant - (x - mean) * scale * slope) * scale;
+fn derive(x: &[f32], dy: &[f32], weight: &[f32], statistics: &[Statistics], dx: &mut [f32]) {
+    let c = weight.len();
+    vectorized(
+        #[inline(always)]
+        move || {
+            let rows = x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(dx.chunks_exact_mut(c));
+            for (((x, dy), dx), &[mean, scale]) in rows.zip(statistics) {
+                let constant = sum([dy, weight], |[dy, w]| dy * w) / c as f32;
+                let slope = sum([dy, weight, x], |[dy, w, x]| dy * w * ((x - mean) * scale)) / c as f32;
+                for (((dx, x), dy), w) in dx.iter_mut().zip(x).zip(dy).zip(weight) {
+                    *dx = (dy * w - constant - (x - mean) * scale * slope) * scale;
+                }
             }
-        }
-    }
+        },
+    );
 }
 
 /// Column sums of dy·h (`weight`) and dy (`bias`), with the normalised row h.
-struct ColumnSums<'a> {
-    x: &'a [f32],
-    dy: &'a [f32],
-    statistics: &'a [Statistics],
-    weight: &'a mut [f32],
-    bias: &'a mut [f32],
-}
-
-impl WithSimd for ColumnSums<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let c = self.weight.len();
-        let rows = self.x.chunks_exact(c).zip(self.dy.chunks_exact(c)).zip(self.statistics);
-        for ((x, dy), &[mean, scale]) in rows {
-            for (((weight, bias), x), dy) in self.weight.iter_mut().zip(&mut *self.bias).zip(x).zip(dy) {
-                *weight += dy * ((x - mean) * scale);
-                *bias += dy;
+fn column_sums(x: &[f32], dy: &[f32], statistics: &[Statistics], (weight, bias): (&mut [f32], &mut [f32])) {
+    let c = weight.len();
+    vectorized(
+        #[inline(always)]
+        move || {
+            for ((x, dy), &[mean, scale]) in x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(statistics) {
+                for (((weight, bias), x), dy) in weight.iter_mut().zip(&mut *bias).zip(x).zip(dy) {
+                    *weight += dy * ((x - mean) * scale);
+                    *bias += dy;
+                }
             }
-        }
-    }
+        },
+    );
 }

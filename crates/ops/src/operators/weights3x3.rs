@@ -53,7 +53,7 @@ impl Conv3x3 {
         let mut read = Floats::new(lines(part));
         let mut values = Floats::new(POINTS * inputs * stride);
         let mut gradients = Floats::new(POINTS * outputs * stride);
-        let mut sums = Floats::new(POINTS * outputs * inputs);
+        let mut products = Floats::new(POINTS * outputs * inputs);
         let mut bias = vec![0.0; outputs];
         let mut add = false;
         let image =
@@ -65,25 +65,18 @@ impl Conv3x3 {
                 let block = Block { row, column, rows, columns: part.min(columns - column) };
                 let room = &mut read[..lines(block.columns)];
                 arch.dispatch(Inputs { source: &x, block, stride, lines: room, out: &mut values });
-                let (room, out, sums_of) = (&mut read[..], &mut gradients, &mut bias[..]);
-                arch.dispatch(OutputGradients {
-                    source: &dy,
-                    block,
-                    stride,
-                    lines: room,
-                    out,
-                    sums: sums_of,
-                });
+                let (lines, out, sums) = (&mut read[..], &mut gradients, &mut bias[..]);
+                arch.dispatch(OutputGradients { source: &dy, block, stride, lines, out, sums });
                 let task = |(point, out)| {
                     let left: &[f32] = &gradients[point * outputs * stride..][..outputs * stride];
                     let right = &values[point * inputs * stride..][..inputs * stride];
                     arch.dispatch(Accumulate { left, right, stride, tiles: block.tiles(), add, out });
                 };
-                let per_point = sums.par_chunks_exact_mut(outputs * inputs).enumerate();
+                let per_point = products.par_chunks_exact_mut(outputs * inputs).enumerate();
                 per_point.with_min_len(TASK_POINTS).for_each(task);
                 add = true;
             }
         }
-        (sums, bias)
+        (products, bias)
     }
 }

@@ -7,21 +7,13 @@ use super::layout::{Conv as Place, Network, Norm, Residual, Step};
 use super::{BRANCH_SCALE, FEATURES, INPUT_CHANNELS};
 use crate::buffers::Floats;
 use crate::fused::{
-    Backward, Branch, CHANNELS, GradientSums, Gradients as ConvGradients, Linear, Merge, Needed, Plane,
-    Source, Upstream, add, arrange, rearrange, transpose,
+    Backward, Branch, CHANNELS, GradientSums, Gradients, Linear, Merge, Needed, Plane, Source, Upstream, add,
+    arrange, rearrange, transpose,
 };
 
-/// Result of [`Network::backward`]; unwanted gradients are empty.
-#[derive(Debug, Default)]
-pub struct Gradients {
-    /// Gradient of the input `[B, H, W, 6]`.
-    pub input: Vec<f32>,
-    /// Gradients of the parameters in the order of [`Network::tensors`].
-    pub parameters: Vec<f32>,
-}
-
 impl Network {
-    /// Gradients of Σ features · `upstream` `[B, H, W, 14]`, with the parameters and the input of the forward pass.
+    /// Gradients of Σ features · `upstream` `[B, H, W, 14]`, with the parameters and the input of the forward pass: of
+    /// the input `[B, H, W, 6]`, and of the parameters in the order of [`Network::names`]; `None` for unwanted ones.
     ///
     /// # Panics
     /// If lengths do not fit the forward pass.
@@ -32,14 +24,13 @@ impl Network {
         saved: Saved,
         upstream: &[f32],
         wanted: Needed,
-    ) -> Gradients {
-        let count = saved.samples.len().max(1);
+    ) -> [Option<Vec<f32>>; 2] {
+        let count = saved.0.len().max(1);
         let (inputs, features) = (input.len() / count, upstream.len() / count);
         let run = |(i, sample): (usize, Sample)| {
             let mut pass = Pass {
                 network: self,
                 parameters,
-                frozen: saved.frozen,
                 wanted,
                 gradients: vec![None; sample.planes.len()],
                 sample,
@@ -48,7 +39,7 @@ impl Network {
             pass.run(&input[i * inputs..][..inputs], &upstream[i * features..][..features]);
             (pass.gradients.swap_remove(0), pass.sums)
         };
-        let parts: Vec<_> = saved.samples.into_par_iter().enumerate().map(run).collect();
+        let parts: Vec<_> = saved.0.into_par_iter().enumerate().map(run).collect();
         let mut sums = vec![0.0; self.parameters()];
         let mut gradient = vec![0.0; if wanted.input { input.len() } else { 0 }];
         // Added in the order of the images, for the same bits with any number of threads.
@@ -58,8 +49,8 @@ impl Network {
                 cut::<INPUT_CHANNELS>(&plane, &mut gradient[i * inputs..][..inputs]);
             }
         }
-        let parameters = sums.iter().map(|&sum| sum as f32).collect();
-        Gradients { input: gradient, parameters: if wanted.parameters { parameters } else { Vec::new() } }
+        let parameters = wanted.parameters.then(|| sums.iter().map(|&sum| sum as f32).collect());
+        [wanted.input.then_some(gradient), parameters]
     }
 }
 
@@ -67,7 +58,6 @@ struct Pass<'a> {
     network: &'a Network,
     parameters: &'a [f32],
     sample: Sample,
-    frozen: bool,
     wanted: Needed,
     /// Gradients of the tape's planes, summed over the readers that are done.
     gradients: Vec<Option<Floats>>,
@@ -122,7 +112,7 @@ impl Pass<'_> {
     }
 
     /// Gradients of the last two convolutions from the gradients of their composition.
-    fn split(&mut self, gradients: &ConvGradients) {
+    fn split(&mut self, gradients: &Gradients) {
         let (first, second) = (&self.network.conv_out, &self.network.gs_conv);
         let (first_weights, first_bias) = arranged(first, self.parameters);
         let (matrix, _) = arranged(second, self.parameters);
@@ -215,7 +205,7 @@ impl Pass<'_> {
         planes: &[&Plane],
         weights: &[f32],
         upstream: Upstream,
-    ) -> ConvGradients {
+    ) -> Gradients {
         let affines = self.network.norm(norm, self.parameters).affines(&self.sample.layers[norm.index]);
         let pairs = planes.iter().zip(affines);
         let sources: Vec<_> = pairs.map(|(&plane, affine)| Source { plane, affine: Some(affine) }).collect();
@@ -226,7 +216,7 @@ impl Pass<'_> {
     /// Adds a normalisation's gradients to the sums. Returns the maps to the planes' gradients.
     fn norm(&mut self, norm: &Norm, planes: &[&Plane], sums: &[GradientSums]) -> Vec<Linear> {
         let group_norm = self.network.norm(norm, self.parameters);
-        let gradients = group_norm.backward(&self.sample.layers[norm.index], planes, sums, self.frozen);
+        let gradients = group_norm.backward(&self.sample.layers[norm.index], planes, sums);
         if self.wanted.parameters {
             let add = |(sum, g): (&mut f64, &f64)| *sum += g;
             self.sums[norm.gamma.clone()].iter_mut().zip(&gradients.gamma).for_each(add);

@@ -10,23 +10,9 @@ use crate::fused::{Affine, CHANNELS, Conv, GroupStatistics, Moments, Plane, Shor
 /// Pixels that are copied at once.
 const TASK: usize = 4096;
 
-/// Result of [`Network::forward`].
-#[derive(Debug)]
-pub struct Forward {
-    /// `[B, H, W, 14]`, before activation.
-    pub features: Vec<f32>,
-    /// Per normalisation: means and reciprocal standard deviations `[B, groups]`, measured or as given.
-    pub statistics: Vec<GroupStatistics>,
-    /// The tape for [`Network::backward`], if kept.
-    pub saved: Option<Saved>,
-}
-
 /// The tape without the input: as many values per image as 16 planes of full size, with 64 bytes per pixel each.
 #[derive(Debug, Clone)]
-pub struct Saved {
-    pub(super) samples: Vec<Sample>,
-    pub(super) frozen: bool,
-}
+pub struct Saved(pub(super) Vec<Sample>);
 
 /// One image's part of the tape.
 #[derive(Debug, Clone, Default)]
@@ -46,8 +32,8 @@ impl Sample {
 }
 
 impl Network {
-    /// The features of `input` `[B, H, W, 6]`, H and W multiples of 4, with `parameters` in the order of
-    /// [`Network::tensors`]. `frozen` statistics replace measured ones. `keep`: a backward pass will follow. Without
+    /// The features `[B, H, W, 14]`, before activation, of `input` `[B, H, W, 6]`, H and W multiples of 4, with
+    /// `parameters` in the order of [`Network::names`]. `keep`: the tape for [`Network::backward`] is kept. Without
     /// `keep`, planes are released after their last reader, and images are computed one after another.
     ///
     /// # Panics
@@ -57,40 +43,27 @@ impl Network {
         parameters: &[f32],
         input: &[f32],
         [b, h, w]: [usize; 3],
-        frozen: Option<&[GroupStatistics]>,
         keep: bool,
-    ) -> Forward {
+    ) -> (Vec<f32>, Option<Saved>) {
         assert!(h % 4 == 0 && w % 4 == 0, "regressor input {h}×{w}: both sides must be multiples of 4");
         assert_eq!(parameters.len(), self.parameters());
         assert_eq!(input.len(), b * h * w * INPUT_CHANNELS);
         let mut features = vec![0.0; b * h * w * FEATURES];
         let last_readers = if keep { Vec::new() } else { self.last_readers() };
-        let run = |(i, (input, features)): (usize, (&[f32], &mut [f32]))| {
-            let part = |values: &Vec<f32>| values[i * self.groups..(i + 1) * self.groups].to_vec();
-            let frozen = frozen.map(|layers| layers.iter().map(|layer| layer.each_ref().map(part)).collect());
+        let run = |(input, features): (&[f32], &mut [f32])| {
             let sample = Sample::default();
-            let mut pass = Pass { network: self, parameters, frozen, sample, last_readers: &last_readers };
+            let mut pass = Pass { network: self, parameters, sample, last_readers: &last_readers };
             let out = pass.run(pad::<INPUT_CHANNELS>(input, [h, w]));
             cut::<FEATURES>(&out.data, features);
             pass.sample
         };
         let [inputs, outputs] = [INPUT_CHANNELS, FEATURES].map(|channels| h * w * channels);
         let samples: Vec<Sample> = if keep {
-            input
-                .par_chunks_exact(inputs)
-                .zip(features.par_chunks_exact_mut(outputs))
-                .enumerate()
-                .map(run)
-                .collect()
+            input.par_chunks_exact(inputs).zip(features.par_chunks_exact_mut(outputs)).map(run).collect()
         } else {
-            input.chunks_exact(inputs).zip(features.chunks_exact_mut(outputs)).enumerate().map(run).collect()
+            input.chunks_exact(inputs).zip(features.chunks_exact_mut(outputs)).map(run).collect()
         };
-        let layer = |k: usize| {
-            [0, 1].map(|part| samples.iter().flat_map(|sample| sample.layers[k][part].clone()).collect())
-        };
-        let statistics = (0..samples.first().map_or(0, |sample| sample.layers.len())).map(layer).collect();
-        let saved = keep.then(|| Saved { samples, frozen: frozen.is_some() });
-        Forward { features, statistics, saved }
+        (features, keep.then_some(Saved(samples)))
     }
 }
 
@@ -134,8 +107,6 @@ pub(super) fn compose(first: &Place, second: &Place, parameters: &[f32]) -> (Vec
 struct Pass<'a> {
     network: &'a Network,
     parameters: &'a [f32],
-    /// Statistics to use instead of measured ones.
-    frozen: Option<Vec<GroupStatistics>>,
     sample: Sample,
     /// The last step that reads each plane; empty if planes are kept.
     last_readers: &'a [usize],
@@ -224,10 +195,7 @@ impl Pass<'_> {
     fn normalise(&mut self, norm: &Norm, inputs: &[usize], hidden: Option<&Plane>) -> Vec<Affine> {
         let planes: Vec<_> = inputs.iter().map(|&i| self.sample.plane(i)).chain(hidden).collect();
         let group_norm = self.network.norm(norm, self.parameters);
-        let layer = match &self.frozen {
-            Some(frozen) => frozen[norm.index].clone(),
-            None => group_norm.measure(&planes),
-        };
+        let layer = group_norm.measure(&planes);
         let affines = group_norm.affines(&layer);
         self.sample.layers.push(layer);
         affines

@@ -3,19 +3,8 @@
 use std::collections::HashMap;
 use std::ops::Range;
 
-use super::{EPSILON, LEVELS};
-use crate::fused::{CHANNELS, GroupNorm};
-
-/// A parameter: its name in a checkpoint, its shape there, and where its values lie.
-#[derive(Debug, Clone)]
-pub struct Tensor {
-    /// The name in the authors' state dict.
-    pub name: String,
-    /// `[out, in, k, k]` or `[n]`.
-    pub shape: Vec<usize>,
-    /// The values' place in the flat vector.
-    pub range: Range<usize>,
-}
+use super::LEVELS;
+use crate::fused::GroupNorm;
 
 /// Where the parameters of a convolution lie.
 #[derive(Debug, Clone)]
@@ -54,33 +43,30 @@ pub(super) enum Step {
 /// The network's structure.
 #[derive(Debug, Clone)]
 pub struct Network {
-    pub(super) groups: usize,
     pub(super) steps: Vec<Step>,
     pub(super) norm_out: Norm,
     pub(super) conv_out: Conv,
     pub(super) gs_conv: Conv,
-    tensors: Vec<Tensor>,
+    names: Vec<String>,
 }
 
 impl Network {
-    /// The network whose normalisations have `groups` groups and whose parameters have these `shapes`, by their names
-    /// in a checkpoint.
+    /// The network whose parameters have these `shapes`, by their names in a checkpoint.
     ///
     /// # Panics
-    /// If `groups` does not divide 16, or if a parameter is missing.
-    pub fn new(groups: usize, shapes: &HashMap<String, Vec<usize>>) -> Self {
-        assert!(groups > 0 && CHANNELS.is_multiple_of(groups), "{groups} groups of 16 channels");
-        let mut places = Places { shapes, tensors: Vec::new(), norms: 0 };
+    /// If a parameter is missing.
+    pub fn new(shapes: &HashMap<String, Vec<usize>>) -> Self {
+        let mut places = Places { shapes, names: Vec::new(), end: 0, norms: 0 };
         let steps = places.steps();
         let norm_out = places.norm("norm_out");
         let conv_out = places.conv("conv_out");
         let gs_conv = places.conv("gs_conv");
-        Self { groups, steps, norm_out, conv_out, gs_conv, tensors: places.tensors }
+        Self { steps, norm_out, conv_out, gs_conv, names: places.names }
     }
 
-    /// All parameters in the order of the flat vector.
-    pub fn tensors(&self) -> &[Tensor] {
-        &self.tensors
+    /// The names of all parameters, as in the authors' state dict, in the order of the flat vector.
+    pub fn names(&self) -> &[String] {
+        &self.names
     }
 
     /// Length of the flat vector.
@@ -103,44 +89,39 @@ impl Network {
     }
 
     pub(super) fn norm<'a>(&self, norm: &Norm, parameters: &'a [f32]) -> GroupNorm<'a> {
-        GroupNorm {
-            groups: self.groups,
-            epsilon: EPSILON,
-            gamma: &parameters[norm.gamma.clone()],
-            beta: &parameters[norm.beta.clone()],
-        }
+        GroupNorm { gamma: &parameters[norm.gamma.clone()], beta: &parameters[norm.beta.clone()] }
     }
 }
 
 /// Assigns consecutive places in the flat vector.
 struct Places<'a> {
     shapes: &'a HashMap<String, Vec<usize>>,
-    tensors: Vec<Tensor>,
+    names: Vec<String>,
+    /// Length of the flat vector so far.
+    end: usize,
     norms: usize,
 }
 
-impl Places<'_> {
-    fn place(&mut self, name: String) -> Range<usize> {
-        let shape =
-            self.shapes.get(&name).unwrap_or_else(|| panic!("the network has no parameter {name}")).clone();
-        let start = self.tensors.last().map_or(0, |tensor| tensor.range.end);
-        let range = start..start + shape.iter().product::<usize>();
-        self.tensors.push(Tensor { name, shape, range: range.clone() });
-        range
+impl<'a> Places<'a> {
+    /// The place and the shape of a parameter.
+    fn place(&mut self, name: String) -> (Range<usize>, &'a [usize]) {
+        let shape = self.shapes.get(&name).unwrap_or_else(|| panic!("the network has no parameter {name}"));
+        let start = self.end;
+        self.end += shape.iter().product::<usize>();
+        self.names.push(name);
+        (start..self.end, shape.as_slice())
     }
 
     fn conv(&mut self, name: &str) -> Conv {
-        let weight = self.place(format!("{name}.weight"));
-        let [to, from, height, width] = self.tensors.last().expect("just placed").shape[..] else {
-            panic!("{name} is no convolution")
-        };
-        let bias = self.place(format!("{name}.bias"));
+        let (weight, shape) = self.place(format!("{name}.weight"));
+        let &[to, from, height, width] = shape else { panic!("{name} is no convolution") };
+        let (bias, _) = self.place(format!("{name}.bias"));
         Conv { weight, bias, shape: [to, from, height * width] }
     }
 
     fn norm(&mut self, name: &str) -> Norm {
-        let gamma = self.place(format!("{name}.weight"));
-        let beta = self.place(format!("{name}.bias"));
+        let (gamma, _) = self.place(format!("{name}.weight"));
+        let (beta, _) = self.place(format!("{name}.bias"));
         self.norms += 1;
         Norm { gamma, beta, index: self.norms - 1 }
     }

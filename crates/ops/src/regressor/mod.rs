@@ -7,9 +7,8 @@ mod backward;
 mod forward;
 mod layout;
 
-pub use backward::Gradients;
-pub use forward::{Forward, Saved};
-pub use layout::{Network, Tensor};
+pub use forward::Saved;
+pub use layout::Network;
 
 /// Channels of the input: red, green, blue in [−1, 1], then x, y, z in metres (front camera's frame).
 pub const INPUT_CHANNELS: usize = 6;
@@ -19,5 +18,3 @@ pub const FEATURES: usize = 14;
 pub const BRANCH_SCALE: f64 = std::f64::consts::FRAC_1_SQRT_2;
 /// Levels of the UNet.
 pub const LEVELS: usize = 3;
-/// Added to every variance.
-pub const EPSILON: f64 = 1e-5;

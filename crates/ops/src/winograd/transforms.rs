@@ -10,6 +10,7 @@ use pulp::{Simd, WithSimd};
 use super::GROUP;
 use super::planes::Planes;
 use super::product::PANEL;
+use crate::vectors::vectorized;
 
 /// Rows and columns of a tile's outputs.
 pub const TILE: usize = 4;
@@ -89,52 +90,46 @@ fn outputs<S: Simd>(simd: S, m: [S::f32s; SPAN]) -> [S::f32s; TILE] {
     ]
 }
 
-/// G·g·Gᵀ of up to 32 filters: `[36][inputs in whole groups][32]`.
-pub struct Filters<'a> {
-    /// The values from the first filter's first tap on.
-    pub weights: &'a [f32],
-    /// At most 32.
-    pub outputs: usize,
-    pub inputs: usize,
-    /// Floats from one filter to the next, and from one input to the next.
-    pub strides: [usize; 2],
-    /// Turns the filters by 180°, for the gradient of a convolution's input.
-    pub turned: bool,
-    pub out: &'a mut [f32],
-}
-
-impl WithSimd for Filters<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _simd: S) {
-        let Self { weights, outputs, inputs, strides, turned, out } = self;
-        let rows = inputs.next_multiple_of(GROUP);
-        let (out, _) = out.as_chunks_mut::<PANEL>();
-        for k in 0..rows {
-            let mut g = [[0.0; PANEL]; 9];
-            if k < inputs {
-                for o in 0..outputs {
-                    let filter = &weights[o * strides[0] + k * strides[1]..];
-                    let filter: &[f32; 9] = filter.first_chunk().expect("nine taps");
-                    for tap in 0..9 {
-                        g[tap][o] = filter[if turned { 8 - tap } else { tap }];
+/// G·g·Gᵀ of up to 32 filters: `[36][inputs in whole groups][32]`. `weights` begin with the first filter's first tap.
+/// `strides`: floats from one filter to the next, and from one input to the next. `turned`: by 180°, for the gradient
+/// of a convolution's input.
+pub fn filters(
+    weights: &[f32],
+    [outputs, inputs]: [usize; 2],
+    strides: [usize; 2],
+    turned: bool,
+    out: &mut [f32],
+) {
+    let rows = inputs.next_multiple_of(GROUP);
+    let (out, _) = out.as_chunks_mut::<PANEL>();
+    vectorized(
+        #[inline(always)]
+        move || {
+            for k in 0..rows {
+                let mut g = [[0.0; PANEL]; 9];
+                if k < inputs {
+                    for o in 0..outputs {
+                        let filter = &weights[o * strides[0] + k * strides[1]..];
+                        let filter: &[f32; 9] = filter.first_chunk().expect("nine taps");
+                        for tap in 0..9 {
+                            g[tap][o] = filter[if turned { 8 - tap } else { tap }];
+                        }
+                    }
+                }
+                let columns = [
+                    filter_points(&g[0], &g[3], &g[6]),
+                    filter_points(&g[1], &g[4], &g[7]),
+                    filter_points(&g[2], &g[5], &g[8]),
+                ];
+                for y in 0..SPAN {
+                    let row = filter_points(&columns[0][y], &columns[1][y], &columns[2][y]);
+                    for (x, values) in row.iter().enumerate() {
+                        out[(SPAN * y + x) * rows + k] = *values;
                     }
                 }
             }
-            let columns = [
-                filter_points(&g[0], &g[3], &g[6]),
-                filter_points(&g[1], &g[4], &g[7]),
-                filter_points(&g[2], &g[5], &g[8]),
-            ];
-            for y in 0..SPAN {
-                let row = filter_points(&columns[0][y], &columns[1][y], &columns[2][y]);
-                for (x, values) in row.iter().enumerate() {
-                    out[(SPAN * y + x) * rows + k] = *values;
-                }
-            }
-        }
-    }
+        },
+    );
 }
 
 /// Bᵀ·d·B of every tile of a block: `[36][groups][stride][16]`.

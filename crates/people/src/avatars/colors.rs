@@ -7,10 +7,10 @@ use glam::{Mat3, Vec2, Vec3};
 use image::{Rgb, RgbImage};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
-use snapsnap_mesh::mesh::Mesh;
+use snapsnap_mesh::mesh::{Mesh, bytes};
 
 use super::joints::Region;
-use crate::math::{sin_cos, smoothstep};
+use crate::math::smoothstep;
 
 /// The part of the body on a texel.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -36,7 +36,7 @@ impl Change {
     /// A random change around `mean`: the hue turns by up to `hue` degrees, and the brightness of `mean` goes the
     /// share `share` of the way to a random brightness.
     fn draw(random: &mut ChaCha8Rng, mean: Vec3, hue: f32, share: f32) -> Self {
-        let (sin, cos) = sin_cos((hue * random.random_range(-1.0..1.0_f32)).to_radians());
+        let (sin, cos) = libm::sincosf((hue * random.random_range(-1.0..1.0_f32)).to_radians());
         // A rotation around the axis of greys.
         let (a, b) = ((1.0 - cos) / 3.0, sin / 3.0_f32.sqrt());
         let row = Vec3::new(cos + a, a - b, a + b);
@@ -71,7 +71,7 @@ fn varied(texture: &RgbImage, shown: &[Shown], random: &mut ChaCha8Rng) -> RgbIm
     // Without hands and body it is a texture of hair.
     if has(Shown::Head) && !has(Shown::Hand) && !has(Shown::Body) {
         let change = Change::draw(random, mean(texture, shown, Shown::Head), 12.0, 0.5);
-        changed.pixels_mut().for_each(|pixel| *pixel = bytes(change.apply(floats(pixel))));
+        changed.pixels_mut().for_each(|pixel| pixel.0 = bytes(change.apply(floats(pixel))));
         return changed;
     }
     let skin = has(Shown::Hand).then(|| mean(texture, shown, Shown::Hand));
@@ -94,7 +94,7 @@ fn varied(texture: &RgbImage, shown: &[Shown], random: &mut ChaCha8Rng) -> RgbIm
             sum += weight * change.apply(color);
             weights += weight;
         }
-        *pixel = bytes(color.lerp(sum / weights, cloth));
+        pixel.0 = bytes(color.lerp(sum / weights, cloth));
     }
     changed
 }
@@ -140,10 +140,6 @@ fn apart(a: Vec3, b: Vec3) -> f32 {
 
 fn floats(pixel: &Rgb<u8>) -> Vec3 {
     Vec3::from(pixel.0.map(f32::from)) / 255.0
-}
-
-fn bytes(color: Vec3) -> Rgb<u8> {
-    Rgb((color * 255.0).round().to_array().map(|c| c as u8))
 }
 
 /// The part of the body on each texel, from the faces that cover the texel.

@@ -28,7 +28,7 @@ pub enum Region {
 pub fn facing(bones: &[import::Bone]) -> Result<f32, String> {
     let names: Vec<Option<(Name, usize)>> = bones.iter().map(|bone| known(&bone.name)).collect();
     let [left, right] =
-        [need(&names, Name::Thigh, 0)?, need(&names, Name::Thigh, 1)?].map(|row| bones[row].place);
+        [need(&names, Name::UpLeg, 0)?, need(&names, Name::UpLeg, 1)?].map(|row| bones[row].place);
     let front = (left - right).cross(Vec3::Y);
     Ok(libm::atan2f(front.x, front.z).to_degrees())
 }
@@ -61,9 +61,8 @@ impl Skeleton {
         let mut lift = 0.0_f32;
         for side in [0, 1] {
             let joint = |name| need(&names, name, side).map(place);
-            let [shoulder, elbow, wrist] =
-                [joint(Name::UpperArm)?, joint(Name::Forearm)?, joint(Name::Hand)?];
-            let [hip, knee, ankle] = [joint(Name::Thigh)?, joint(Name::Calf)?, joint(Name::Foot)?];
+            let [shoulder, elbow, wrist] = [joint(Name::Arm)?, joint(Name::ForeArm)?, joint(Name::Hand)?];
+            let [hip, knee, ankle] = [joint(Name::UpLeg)?, joint(Name::Leg)?, joint(Name::Foot)?];
             let down = (elbow - shoulder).normalize_or(Vec3::NEG_Y);
             // Assumes that the arm was raised from its side without a twist.
             let hinge = Quat::from_rotation_arc(Vec3::NEG_Y, down) * Vec3::X;
@@ -90,7 +89,7 @@ impl Skeleton {
         };
         let count = |known: (Name, usize)| names.iter().filter(|name| **name == Some(known)).count();
         // By chain: the number of joints that are still to come.
-        let chains = [(Name::UpperArm, 0), (Name::UpperArm, 1), (Name::Thigh, 0), (Name::Thigh, 1)];
+        let chains = [(Name::Arm, 0), (Name::Arm, 1), (Name::UpLeg, 0), (Name::UpLeg, 1)];
         let mut left: HashMap<(Name, usize), usize> =
             chains.into_iter().map(|name| (name, count(name))).collect();
         let (spines, mut spine) = (count((Name::Spine, 0)), 0);
@@ -123,14 +122,12 @@ impl Skeleton {
                 Some((Name::Head, _)) => (Joint::Head(1.0), Region::Head),
                 Some((Name::Clavicle, side)) => (Joint::Clavicle(side), Region::Trunk),
                 Some((Name::Shoulder, side)) => (Joint::UpperArm(side, 2), Region::Trunk),
-                Some((Name::UpperArm, side)) => {
-                    (Joint::UpperArm(side, after(Name::UpperArm, side)), Region::Arm)
-                }
-                Some((Name::Forearm, side)) => (Joint::Forearm(side), Region::Arm),
+                Some((Name::Arm, side)) => (Joint::UpperArm(side, after(Name::Arm, side)), Region::Arm),
+                Some((Name::ForeArm, side)) => (Joint::Forearm(side), Region::Arm),
                 Some((Name::Hand, side)) => (Joint::Parent, Region::Hand(side)),
                 Some((Name::Finger(_), side)) => (Joint::Finger(palms[side]), Region::Hand(side)),
-                Some((Name::Thigh, side)) => (Joint::Thigh(side, after(Name::Thigh, side)), Region::Leg),
-                Some((Name::Calf, side)) => (Joint::Calf(side), Region::Leg),
+                Some((Name::UpLeg, side)) => (Joint::Thigh(side, after(Name::UpLeg, side)), Region::Leg),
+                Some((Name::Leg, side)) => (Joint::Calf(side), Region::Leg),
                 Some((Name::Foot, side)) => (Joint::Foot(side), Region::Foot),
                 _ => (Joint::Parent, above),
             };

@@ -108,20 +108,17 @@ impl Fitted {
         let first = mesh.positions.len() as u32;
         mesh.positions.extend(vertices.iter().map(|vertex| vertex.posed));
         let size = self.metres();
-        let mut materials: Vec<Option<u32>> = vec![None; self.pieces.iter().max().map_or(0, |last| last + 1)];
         // Hair and hats have many pieces of one colour.
-        let mut made: Vec<(Cloth, u32)> = Vec::new();
+        let mut made: Vec<Cloth> = Vec::new();
+        let before = mesh.materials.len();
         for ((face, texcoords), piece) in faces.iter().zip(&self.texcoords).zip(&self.pieces) {
-            let material = *materials[*piece].get_or_insert_with(|| {
-                let cloth = cloth(*piece);
-                if let Some((_, material)) = made.iter().find(|(other, _)| *other == cloth) {
-                    return *material;
-                }
-                let row = mesh.materials.len() as u32;
+            let cloth = cloth(*piece);
+            let row = made.iter().position(|other| *other == cloth).unwrap_or_else(|| {
                 mesh.materials.push(material(&cloth, size));
-                made.push((cloth, row));
-                row
+                made.push(cloth);
+                made.len() - 1
             });
+            let material = (before + row) as u32;
             let place = mesh.texcoords.len() as u32;
             mesh.texcoords.extend(texcoords);
             for i in 1..face.len() as u32 - 1 {

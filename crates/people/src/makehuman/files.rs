@@ -1,19 +1,24 @@
 //! MakeHuman's files: base mesh, morph targets, rig and skin weights.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use glam::Vec3;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
-use snapsnap_base::{FileError, quoted};
+use snapsnap_base::{FileError, file, quoted};
 
-use super::proxy::Wardrobe;
-use super::text::{read_text, vector, wrong};
+use super::proxy::{Proxy, wardrobe};
+use crate::files::with_ending;
 use crate::poses::Poses;
 
+/// Metres per unit of MakeHuman's files, a decimetre.
+pub const METRES: f32 = 0.1;
+/// Size limit of a file. The largest of MakeHuman's files has a few megabytes.
+const MAX_BYTES: u64 = 256 << 20;
+/// Largest coordinate, decimetres.
+const LARGEST: f32 = 1000.0;
 /// Required groups of the base mesh and bones of the rig.
 const GROUPS: [&str; 5] = ["body", "helper-tights", "helper-skirt", "helper-l-eye", "helper-r-eye"];
 const BONES: [&str; 5] = ["spine03", "neck01", "head", "jaw", "oris01"];
@@ -50,7 +55,7 @@ pub struct Library {
     /// Poses of the folder `poses`, if there is one.
     pub poses: Option<Poses>,
     /// Clothes and hair.
-    pub wardrobe: Wardrobe,
+    pub wardrobe: Vec<Arc<Proxy>>,
 }
 
 impl Library {
@@ -81,7 +86,7 @@ impl Library {
             let path = root.join("rigs/default.mhskel");
             return Err(FileError::unsuitable(&path, format!("has no bone `{bone}`")));
         }
-        let wardrobe = Wardrobe::open(&root, positions.len())?;
+        let wardrobe = wardrobe(&root, positions.len())?;
         let folder = root.join("poses");
         let poses = if folder.is_dir() { Poses::open(&folder)? } else { None };
         let targets = Mutex::default();
@@ -94,7 +99,13 @@ impl Library {
     /// [`FileError`] if it is missing or damaged.
     pub fn target(&self, name: &str) -> Result<Target, FileError> {
         let path = self.root.join("targets").join(format!("{name}.target"));
-        once(&self.targets, &path, || read_target(&path, self.positions.len()))
+        let targets = || self.targets.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(target) = targets().get(&path) {
+            return Ok(target.clone());
+        }
+        let target = Arc::new(read_target(&path, self.positions.len())?);
+        targets().insert(path, target.clone());
+        Ok(target)
     }
 
     /// Names of the targets in a folder below `targets`, in order.
@@ -102,30 +113,28 @@ impl Library {
     /// # Errors
     /// [`FileError::Read`] if it is missing.
     pub fn targets_in(&self, folder: &str) -> Result<Vec<String>, FileError> {
-        let path = self.root.join("targets").join(folder);
-        let mut names = Vec::new();
-        for entry in fs::read_dir(&path).map_err(FileError::read(&path))? {
-            let name = entry.map_err(FileError::read(&path))?.file_name().to_string_lossy().into_owned();
-            names.extend(name.strip_suffix(".target").map(str::to_owned));
-        }
+        let files = with_ending(&self.root.join("targets").join(folder), "target")?;
+        // A target is opened by its stem and the ending in small letters.
+        let targets = files.iter().filter(|file| file.extension().is_some_and(|ending| ending == "target"));
+        let stems = targets.filter_map(|file| file.file_stem());
+        let mut names: Vec<String> = stems.map(|stem| stem.to_string_lossy().into_owned()).collect();
         names.sort_unstable();
         Ok(names)
     }
 }
 
-/// The cached value of a file, or else the result of `read`.
-fn once<T>(
-    cache: &Mutex<HashMap<PathBuf, Arc<T>>>,
-    path: &Path,
-    read: impl FnOnce() -> Result<T, FileError>,
-) -> Result<Arc<T>, FileError> {
-    let locked = || cache.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Some(value) = locked().get(path) {
-        return Ok(value.clone());
-    }
-    let value = Arc::new(read()?);
-    locked().insert(path.to_owned(), value.clone());
-    Ok(value)
+pub fn read_text(path: &Path) -> Result<String, FileError> {
+    file::read_text(path, MAX_BYTES).map_err(FileError::read(path))
+}
+
+pub fn wrong(path: &Path, line: usize, text: &str) -> FileError {
+    FileError::unsuitable(path, format!("line {}, `{}`: not understood", line + 1, quoted(text)))
+}
+
+/// Three numbers within ±`LARGEST`, converted to metres.
+pub fn vector<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
+    let mut next = || words.next()?.parse().ok().filter(|v: &f32| v.abs() < LARGEST);
+    Some(METRES * Vec3::new(next()?, next()?, next()?))
 }
 
 fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T, FileError> {

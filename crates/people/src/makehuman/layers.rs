@@ -126,7 +126,10 @@ impl Person<'_> {
 
     /// The bottom and the top. The bottom is pressed in below the top, as skin is below both.
     pub fn layers(&self) -> [Piece; 2] {
-        let (mut bottom, top) = (self.bottom(), self.top());
+        let top = self.top();
+        let kinds = [Kind::Trunk, Kind::Leg];
+        let mut bottom =
+            self.layer(&kinds, |vertex| self.in_bottom(vertex), |vertex| self.off_bottom(vertex));
         let depth = |vertex: &Vertex| self.in_top(vertex).min(self.in_bottom(vertex));
         let depths: Vec<f32> = bottom.patch.vertices.iter().map(depth).collect();
         press_in(&mut bottom.patch, &depths, &top.patch, GAP);
@@ -154,14 +157,6 @@ impl Person<'_> {
                 let over = smoothstep(-0.03, 0.0, self.in_bottom(vertex));
                 off.max(over * (self.off_bottom(vertex) + GAP))
             },
-        )
-    }
-
-    fn bottom(&self) -> Piece {
-        self.layer(
-            &[Kind::Trunk, Kind::Leg],
-            |vertex| self.in_bottom(vertex),
-            |vertex| self.off_bottom(vertex),
         )
     }
 

@@ -14,7 +14,6 @@ mod proxy;
 mod rig;
 #[cfg(test)]
 mod tests;
-mod text;
 
 use glam::Vec3;
 use snapsnap_base::FileError;
@@ -70,7 +69,7 @@ impl Person<'_> {
             surface.faces.extend(patch.triangles().map(|face| face.map(|row| row + first)));
         }
         let bare = [self.worn.suit.is_some(), self.worn.shoes.is_some()];
-        let painter = Painter::new(&self.figure, &self.outfit, &self.face).bare(bare);
+        let painter = Painter::new(&self.figure, &self.outfit, &self.face, bare);
         let mut mesh = atlas::paint(&self.body, &surface, &painter);
         mesh.positions = positions;
         self.add_worn(&mut mesh);

@@ -105,10 +105,9 @@ impl<'a> Person<'a> {
         let (vertices, placed) = pose.free_hands(posed, sunk);
 
         let body = Body::new(&figure, &outfit);
-        let row = |kind: Kind, side: usize| {
+        let rows = ORDER.map(|(kind, side)| {
             body.parts.iter().position(|part| part.kind == kind && part.side == side).unwrap_or(0)
-        };
-        let rows = ORDER.map(|(kind, side)| row(kind, side));
+        });
         Ok(Self {
             library,
             marks: Marks::of(&figure, &outfit),

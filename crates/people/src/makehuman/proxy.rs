@@ -9,8 +9,8 @@ use rand::Rng;
 use snapsnap_base::FileError;
 use snapsnap_mesh::mesh::pieces;
 
+use super::files::{METRES, read_text, vector, wrong};
 use super::patch::{Patch, Vertex};
-use super::text::{METRES, read_text, vector, wrong};
 use crate::files::{entries, with_ending};
 use crate::pattern::Pattern;
 use crate::synth::outfit::{Cut, Outfit};
@@ -54,6 +54,8 @@ type Corners = (Vec<u32>, Vec<Vec2>);
 /// A proxy.
 #[derive(Debug, Clone)]
 pub struct Proxy {
+    /// File name in lower case.
+    name: String,
     /// Clothes have their kind in their tags.
     kind: Kind,
     bindings: Vec<Binding>,
@@ -74,53 +76,36 @@ pub struct Fitted {
     pub pieces: Vec<usize>,
 }
 
-/// The proxies of MakeHuman's folders.
-#[derive(Debug, Default)]
-pub struct Wardrobe {
-    proxies: Vec<Stored>,
-}
-
-/// A proxy of a wardrobe.
-#[derive(Debug)]
-struct Stored {
-    /// File name in lower case.
-    name: String,
-    proxy: Arc<Proxy>,
-}
-
-impl Wardrobe {
-    /// Reads the proxies in the folders `clothes` and `hair` of MakeHuman's `data`, for a base mesh of `vertices`
-    /// vertices. Missing folders are empty. Unused proxies are read, too, so that damaged files are always found.
-    ///
-    /// # Errors
-    /// [`FileError`] for a file that is damaged or cannot be read.
-    pub fn open(root: &Path, vertices: usize) -> Result<Self, FileError> {
-        let mut proxies = Vec::new();
-        for folder in ["clothes", "hair"] {
-            let path = root.join(folder);
-            let assets = if path.is_dir() { entries(&path)? } else { Vec::new() };
-            for asset in assets.iter().filter(|asset| asset.is_dir()) {
-                for path in with_ending(asset, "mhclo")? {
-                    let mut proxy = Proxy::read(&path, vertices)?;
-                    if folder == "hair" {
-                        proxy.kind = Kind::Hair;
-                    }
-                    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
-                    proxies.push(Stored { name, proxy: Arc::new(proxy) });
+/// Reads the proxies in the folders `clothes` and `hair` of MakeHuman's `data`, for a base mesh of `vertices` vertices.
+/// Missing folders are empty. Unused proxies are read, too, so that damaged files are always found.
+///
+/// # Errors
+/// [`FileError`] for a file that is damaged or cannot be read.
+pub fn wardrobe(root: &Path, vertices: usize) -> Result<Vec<Arc<Proxy>>, FileError> {
+    let mut proxies = Vec::new();
+    for folder in ["clothes", "hair"] {
+        let path = root.join(folder);
+        let assets = if path.is_dir() { entries(&path)? } else { Vec::new() };
+        for asset in assets.iter().filter(|asset| asset.is_dir()) {
+            for path in with_ending(asset, "mhclo")? {
+                let mut proxy = Proxy::read(&path, vertices)?;
+                if folder == "hair" {
+                    proxy.kind = Kind::Hair;
                 }
+                proxies.push(Arc::new(proxy));
             }
         }
-        Ok(Self { proxies })
     }
+    Ok(proxies)
+}
 
-    /// A random proxy of this kind for this sex, 0 female and 1 male.
-    pub fn choose(&self, kind: Kind, sex: f32, random: &mut impl Rng) -> Option<Arc<Proxy>> {
-        let other = if sex < 0.5 { "male_" } else { "female_" };
-        let fits = |stored: &&Stored| stored.proxy.kind == kind && !stored.name.starts_with(other);
-        let fitting: Vec<&Stored> = self.proxies.iter().filter(fits).collect();
-        let draw: f32 = random.random_range(0.0..1.0);
-        fitting.get((draw * fitting.len() as f32) as usize).map(|stored| stored.proxy.clone())
-    }
+/// A random proxy of this kind for this sex, 0 female and 1 male.
+fn choose(wardrobe: &[Arc<Proxy>], kind: Kind, sex: f32, random: &mut impl Rng) -> Option<Arc<Proxy>> {
+    let other = if sex < 0.5 { "male_" } else { "female_" };
+    let fits = |proxy: &&Arc<Proxy>| proxy.kind == kind && !proxy.name.starts_with(other);
+    let fitting: Vec<&Arc<Proxy>> = wardrobe.iter().filter(fits).collect();
+    let draw: f32 = random.random_range(0.0..1.0);
+    fitting.get((draw * fitting.len() as f32) as usize).copied().cloned()
 }
 
 /// The proxies that a person wears.
@@ -135,7 +120,7 @@ pub struct Worn {
 
 impl Worn {
     pub fn draw(
-        wardrobe: &Wardrobe,
+        wardrobe: &[Arc<Proxy>],
         outfit: &Outfit,
         sex: f32,
         is_draped: bool,
@@ -143,7 +128,7 @@ impl Worn {
     ) -> Self {
         let [suit, shoes, hair, hat] = [(); 4].map(|()| random.random_range(0.0..1.0_f32));
         let mut choose =
-            |kind: Kind, is_wanted: bool| wardrobe.choose(kind, sex, random).filter(|_| is_wanted);
+            |kind: Kind, is_wanted: bool| choose(wardrobe, kind, sex, random).filter(|_| is_wanted);
         let own_shoes = choose(Kind::Shoes, true);
         let suit = choose(Kind::Suit, !is_draped && suit < SUITS && own_shoes.is_some());
         let has_shoes = suit.is_some() || shoes < SHOES;
@@ -175,6 +160,7 @@ impl Proxy {
     pub fn read(path: &Path, vertices: usize) -> Result<Self, FileError> {
         let text = read_text(path)?;
         let mut proxy = Self {
+            name: path.file_name().unwrap_or_default().to_string_lossy().to_lowercase(),
             kind: Kind::Suit,
             bindings: Vec::new(),
             scales: [None; 3],
@@ -186,18 +172,12 @@ impl Proxy {
         let inside = |row: &u32| (*row as usize) < vertices;
         for (number, line) in text.lines().enumerate() {
             let mut words = line.split_ascii_whitespace();
-            let Some(first) = words.clone().next().filter(|word| !word.starts_with('#')) else { continue };
+            let Some(first) = words.next().filter(|word| !word.starts_with('#')) else { continue };
             let bad = || wrong(path, number, line);
-            if first.starts_with(|c: char| c.is_ascii_digit()) && is_hidden {
-                hide(line, &mut proxy.hides).ok_or_else(bad)?;
-                continue;
-            }
-            if first.starts_with(|c: char| c.is_ascii_digit()) && is_list {
-                proxy.bindings.push(binding(line, vertices).ok_or_else(bad)?);
-                continue;
-            }
-            words.next();
+            let is_number = first.starts_with(|c: char| c.is_ascii_digit());
             match first {
+                _ if is_number && is_hidden => hide(line, &mut proxy.hides).ok_or_else(bad)?,
+                _ if is_number && is_list => proxy.bindings.push(binding(line, vertices).ok_or_else(bad)?),
                 "obj_file" => mesh = words.next(),
                 "tag" => match words.next().map(str::to_ascii_lowercase).as_deref() {
                     Some("shoes") => proxy.kind = Kind::Shoes,

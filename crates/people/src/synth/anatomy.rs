@@ -8,7 +8,6 @@ use snapsnap_mesh::mesh::bounds;
 use super::outfit::{Cut, Lower, Outfit};
 use super::part::{Drape, Kind, Layer, Marks, Part, Shape};
 use crate::figure::{Bone, Figure, sign};
-use crate::math::sin_cos;
 
 pub fn trunk(figure: &Figure, outfit: &Outfit) -> Part {
     let Figure { build, pelvis, chest, neck, .. } = figure;
@@ -164,7 +163,7 @@ pub fn hand(figure: &Figure, side: usize) -> Part {
     let (palm, flat) = ([0.19 * length, 0.235 * length], Vec3::new(1.0, 1.0, 0.55));
     let mut shapes = vec![Shape::capsule(at(0.0, 0.08, 0.0), at(0.0, -0.36, 0.0), palm, hand.frame, flat)];
     // Palms face backwards in the hand's frame; fingers curl towards the palm.
-    let (curl_sin, curl_cos) = sin_cos(figure.fingers * PI / 180.0);
+    let (curl_sin, curl_cos) = libm::sincosf(figure.fingers * PI / 180.0);
     for (i, reach) in [0.43, 0.5, 0.47, 0.37].into_iter().enumerate() {
         let x = inwards * (0.165 - 0.11 * i as f32);
         let knuckle = at(x, -0.46, 0.0);

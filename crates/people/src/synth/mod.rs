@@ -28,7 +28,7 @@ const CELL: f32 = 0.005;
 pub fn person(name: &str, poses: Option<&Poses>) -> Mesh {
     let (figure, outfit, body) = dressed(name, poses);
     let surface = surface::mesh(&body, CELL);
-    let mut mesh = atlas::paint(&body, &surface, &Painter::new(&figure, &outfit, &FACE));
+    let mut mesh = atlas::paint(&body, &surface, &Painter::new(&figure, &outfit, &FACE, [false; 2]));
     mesh.positions = surface.positions;
     stand(&mut mesh);
     mesh

@@ -37,15 +37,10 @@ pub struct Painter<'a> {
 }
 
 impl<'a> Painter<'a> {
-    pub fn new(figure: &Figure, outfit: &'a Outfit, face: &'a Face) -> Self {
+    /// `bare`: whether trunk, arms and legs, and whether feet, get the colour of skin instead of cloth.
+    pub fn new(figure: &Figure, outfit: &'a Outfit, face: &'a Face, bare: [bool; 2]) -> Self {
         let chest = 1.7 * figure.pelvis.length() + 0.55 * figure.chest.length();
-        Self { outfit, marks: Marks::of(figure, outfit), chest, face, bare: [false; 2] }
-    }
-
-    /// Whether trunk, arms and legs, and whether feet, get the colour of skin instead of cloth.
-    #[must_use]
-    pub fn bare(self, bare: [bool; 2]) -> Self {
-        Self { bare, ..self }
+        Self { outfit, marks: Marks::of(figure, outfit), chest, face, bare }
     }
 
     /// Colour at a point of a part's chart: angle around the axis (0 in front, positive towards +x), metres along it.

@@ -9,7 +9,7 @@ use glam::{Mat3, Vec2, Vec3, Vec3Swizzles};
 
 use super::outfit::Outfit;
 use crate::figure::{Bone, Figure};
-use crate::math::{noise, sin_cos, smooth_min, smoothstep};
+use crate::math::{noise, smooth_min, smoothstep};
 
 /// A tapered capsule or an ellipsoid. In its own frame the shape is round.
 #[derive(Debug, Clone, Copy)]
@@ -98,7 +98,7 @@ impl Layer {
 
 /// Depth of a neckline at this angle, from its depth in front and behind.
 pub fn neckline([front, behind]: [f32; 2], angle: f32) -> f32 {
-    let cosine = sin_cos(angle).1;
+    let cosine = libm::sincosf(angle).1;
     let depth = if cosine > 0.0 { front } else { behind };
     depth * cosine * cosine
 }
@@ -145,7 +145,7 @@ impl Drape {
         let q = p.xz() - centre;
         let angle = libm::atan2f(q.x, q.y);
         let sway = 1.3 * (noise(Vec3::new(3.0 * t, 0.0, 0.0), self.seed) - 0.5);
-        let fold = 1.0 + self.depth * smoothstep(0.05, 1.0, t) * sin_cos(self.folds * angle + sway).0;
+        let fold = 1.0 + self.depth * smoothstep(0.05, 1.0, t) * libm::sincosf(self.folds * angle + sway).0;
         let scale = radii.min_element();
         // The surface leans, so that the distance to it is shorter than the horizontal one.
         let aside = ((q / radii).length() - fold) * scale * 0.9;
@@ -232,12 +232,8 @@ impl Part {
 
     /// Distance to the skin.
     pub fn skin(&self, p: Vec3) -> f32 {
-        let mut skin = f32::INFINITY;
-        for shape in &self.shapes {
-            let d = shape.distance(p);
-            skin = if skin.is_finite() { smooth_min(skin, d, self.blend) } else { d };
-        }
-        skin
+        let distances = self.shapes.iter().map(|shape| shape.distance(p));
+        distances.reduce(|skin, d| smooth_min(skin, d, self.blend)).unwrap_or(f32::INFINITY)
     }
 
     /// Distance to the part's surface. `skin` is the distance to the skin; drapes ignore it.

@@ -1,7 +1,7 @@
 use std::collections::{HashMap, HashSet};
 
 use glam::Vec3;
-use snapsnap_mesh::mesh::Face;
+use snapsnap_mesh::mesh::{Face, pieces};
 
 use super::*;
 
@@ -13,22 +13,16 @@ fn people_are_closed_and_of_one_piece() {
         let mesh = person(&format!("test/{index}"), None);
         assert_eq!(mesh.check(), Ok(()));
         let mut edges: HashMap<(u32, u32), i32> = HashMap::new();
-        let mut neighbours: HashMap<u32, Vec<u32>> = HashMap::new();
         for face in &mesh.faces {
             let [a, b, c] = face.positions;
             for (from, to) in [(a, b), (b, c), (c, a)] {
                 *edges.entry((from.min(to), from.max(to))).or_default() += if from < to { 1 } else { -1 };
-                neighbours.entry(from).or_default().push(to);
             }
         }
         let open = edges.values().filter(|balance| **balance != 0).count();
         assert_eq!(open, 0, "person {index}: {open} of {} edges are open", edges.len());
-        let mut reached = HashSet::from([mesh.faces[0].positions[0]]);
-        let mut next: Vec<u32> = reached.iter().copied().collect();
-        while let Some(row) = next.pop() {
-            next.extend(neighbours[&row].iter().filter(|other| reached.insert(**other)));
-        }
-        assert_eq!(reached.len(), neighbours.len(), "person {index}");
+        let pieces = pieces(mesh.positions.len(), mesh.faces.iter().map(|face| &face.positions[..]));
+        assert!(pieces.iter().all(|piece| *piece == 0), "person {index}");
         // Normals point outwards, and the surface has the volume of a person.
         let volume: f32 = mesh
             .faces
@@ -58,7 +52,7 @@ fn hands_and_hips_stay_where_they_belong() {
         skirts += 1;
         // Outwards from the middle of the hips to the surface.
         for step in 0..24 {
-            let (sin, cos) = crate::math::sin_cos(step as f32 * std::f32::consts::PI / 12.0);
+            let (sin, cos) = libm::sincosf(step as f32 * std::f32::consts::PI / 12.0);
             let mut p = Vec3::new(0.0, figure.pelvis.start.y - 0.02, 0.0);
             while body.distance(p, 0.02).0 < 0.0 {
                 p += 0.002 * Vec3::new(sin, 0.0, cos);

@@ -29,6 +29,11 @@ impl<T> Inputs<T> {
         Inputs { means, rotations, scales, opacities, colors }
     }
 
+    pub fn as_mut(&mut self) -> Inputs<&mut T> {
+        let Self { means, rotations, scales, opacities, colors } = self;
+        Inputs { means, rotations, scales, opacities, colors }
+    }
+
     pub fn map<U>(self, f: impl FnMut(T) -> U) -> Inputs<U> {
         Inputs::from_array(self.into_array().map(f))
     }

@@ -133,10 +133,9 @@ pub fn parse(bytes: &[u8]) -> Result<Header, String> {
     let mut number = 0;
     let mut line = || -> Result<(usize, String), String> {
         number += 1;
-        let end = rest.iter().position(|&b| b == b'\n').ok_or_else(|| match number {
-            1 => "not a PLY file: it does not start with `ply`".to_owned(),
-            _ if bytes.len() > MAX_HEADER => format!("the header is longer than {MAX_HEADER} bytes"),
-            _ => "the header has no end: `end_header` is missing".to_owned(),
+        let end = rest.iter().position(|&b| b == b'\n').ok_or_else(|| match bytes.len() {
+            0..=MAX_HEADER => "the header has no end: `end_header` is missing".to_owned(),
+            _ => format!("the header is longer than {MAX_HEADER} bytes"),
         })?;
         let text =
             std::str::from_utf8(&rest[..end]).map_err(|_| format!("header line {number}: not text"))?;

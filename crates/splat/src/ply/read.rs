@@ -5,7 +5,7 @@ use std::io::{self, BufRead, BufReader, Cursor, Read};
 
 use super::Y_DOWN;
 use super::header::{Element, Format, Header, MAX_HEADER, Property, parse};
-use crate::stored::{Problem, Stored};
+use crate::stored::{COEFFICIENTS, Problem, Stored};
 use snapsnap_base::quoted;
 
 /// Longest line of a body in text.
@@ -47,15 +47,9 @@ fn table(header: &Header, body: &mut impl BufRead) -> Result<Stored, Problem> {
         })?);
     }
     let rest = vertex.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
-    let coefficients = match rest {
-        0 => 1,
-        9 => 4,
-        24 => 9,
-        45 => 16,
-        _ => {
-            let message = format!("{rest} properties `f_rest_*`; SH of degree 0 to 3 have 0, 9, 24 or 45");
-            return Err(message.into());
-        }
+    let Some(coefficients) = COEFFICIENTS.into_iter().find(|count| 3 * (count - 1) == rest) else {
+        let message = format!("{rest} properties `f_rest_*`; SH of degree 0 to 3 have 0, 9, 24 or 45");
+        return Err(message.into());
     };
     for index in 0..rest {
         let name = format!("f_rest_{index}");

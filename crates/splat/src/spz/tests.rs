@@ -42,13 +42,26 @@ fn content(gzip: &[u8]) -> Vec<u8> {
     bytes
 }
 
+/// The bytes of a file.
+fn written(stored: &Stored) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    write(stored, &mut bytes).expect("written");
+    bytes
+}
+
+/// The Gaussians of a file of `stored`.
+fn again(stored: &Stored) -> Stored {
+    let bytes = written(stored);
+    read(&bytes[..], bytes.len() as u64).expect("was written just now")
+}
+
 #[test]
 fn niantics_files_are_read_as_niantics_library_reads_them() {
     for name in ["v2_degree0", "v3_degree0", "v3_degree3"] {
         let (bytes, values) = reference(name);
         let degree = values["degree"].as_u64().expect("a degree");
         let expected = stored(&values["output"], degree);
-        let found = read(&bytes[..], bytes.len() as u64).unwrap_or_else(|_| panic!("{name}"));
+        let found = read(&bytes[..], bytes.len() as u64).expect(name);
         assert_eq!(found.degree() as u64, degree);
         assert_eq!(found.columns.len(), expected.columns.len());
         for (row, (found, expected)) in found.columns.iter().zip(&expected.columns).enumerate() {
@@ -63,10 +76,8 @@ fn niantics_files_are_read_as_niantics_library_reads_them() {
 fn what_is_written_is_what_niantics_library_writes() {
     for name in ["v3_degree0", "v3_degree3"] {
         let (expected, values) = reference(name);
-        let mut bytes = Vec::new();
         let stored = stored(&values["input"], values["degree"].as_u64().expect("a degree"));
-        write(&stored, &mut bytes).expect("written");
-        let (found, expected) = (content(&bytes), content(&expected));
+        let (found, expected) = (content(&written(&stored)), content(&expected));
         assert_eq!(found.len(), expected.len(), "{name}");
         let other = found.iter().zip(&expected).filter(|(a, b)| a.abs_diff(**b) > 0).count();
         // Rounding in f32 and f64 differs where a value lies in the middle of two steps.
@@ -76,10 +87,9 @@ fn what_is_written_is_what_niantics_library_writes() {
 
 #[test]
 fn what_is_no_spz_or_a_damaged_one_is_refused() {
-    let problem = |bytes: &[u8]| match read(bytes, bytes.len() as u64) {
-        Ok(_) => panic!("was read"),
-        Err(Problem::Content(problem)) => problem,
-        Err(Problem::Io(e)) => panic!("{e}"),
+    let problem = |bytes: &[u8]| match read(bytes, bytes.len() as u64).expect_err("was read") {
+        Problem::Content(problem) => problem,
+        Problem::Io(e) => panic!("{e}"),
     };
     let (good, _) = reference("v3_degree3");
     let packed = |content: &[u8]| {
@@ -128,9 +138,7 @@ fn quaternions_of_any_length_and_sign_keep_their_rotation() {
 fn far_away_places_get_coarser_steps_and_that_is_told() {
     let mut values = stored(&reference("v3_degree0").1["input"], 0);
     values.columns[0][0] = -70_000.0;
-    let mut bytes = Vec::new();
-    write(&values, &mut bytes).expect("written");
-    let Ok(found) = read(&bytes[..], bytes.len() as u64) else { panic!("was written just now") };
+    let found = again(&values);
     assert!((found.columns[0][0] + 70_000.0).abs() < 0.01);
     assert!((found.columns[1][0] - values.columns[1][0]).abs() <= 0.5 / 64.0);
     let told = losses(&values);
@@ -162,9 +170,7 @@ fn what_lies_beyond_the_range_is_counted() {
         assert!(told.starts_with(expected), "{told}");
     }
     // Values beyond the range are clamped.
-    let mut bytes = Vec::new();
-    write(&values, &mut bytes).expect("written");
-    let Ok(found) = read(&bytes[..], bytes.len() as u64) else { panic!("was written just now") };
+    let found = again(&values);
     assert_eq!(found.columns[7][0], 255.0 / 16.0 - 10.0);
     assert_eq!(losses(&found), Vec::<String>::new());
 }

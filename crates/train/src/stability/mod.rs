@@ -8,7 +8,7 @@ use snapsnap_base::config::Schema;
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::Region;
 use snapsnap_eval::similarity::{psnr, ssim};
-use snapsnap_eval::stability::{Case, Found};
+use snapsnap_eval::stability::{Case, Found, all_finite, apart, tracked, worst};
 use snapsnap_net::Window;
 use snapsnap_net::network::{PointMap, View};
 use snapsnap_net::weights::random_predictor;
@@ -17,9 +17,9 @@ use snapsnap_ops::host;
 use crate::config::TrainConfig;
 use crate::networks::{Networks, Rows};
 use crate::optimizer::{BETA1, EPSILON, MUON_WEIGHT_DECAY, MuonSettings, OptimizerConfig, WEIGHT_DECAY};
-use crate::photometric::Photometric;
 use crate::points::losses;
 use crate::schedule::Schedule;
+use crate::stage2::photometric;
 use snapsnap_net::Prediction;
 
 /// A short training of small networks.
@@ -86,19 +86,7 @@ pub fn cases(many_steps: u64) -> Vec<Case> {
 
 /// A case on every device, without an error of gradients.
 fn case(input: &str, holds: &str, value_limit: f64, run: impl Fn(&Device) -> Found + 'static) -> Case {
-    Case {
-        area: "Losses and optimiser",
-        input: input.to_owned(),
-        holds: holds.to_owned(),
-        value_limit,
-        gradient_limit: 0.0,
-        once: false,
-        run: Box::new(run),
-    }
-}
-
-fn finite(values: &[f32]) -> bool {
-    values.iter().all(|v| v.is_finite())
+    Case::new("Losses and optimiser", input, holds, [value_limit, 0.0], run)
 }
 
 /// A front view of 4 × 4 pixels, `count` of which have a true point. Predictions and ground truth of the others have
@@ -106,14 +94,13 @@ fn finite(values: &[f32]) -> bool {
 fn point_loss(count: usize, device: &Device) -> Found {
     const SIDE: usize = 4;
     const AREA: usize = SIDE * SIDE;
-    let device = device.clone().autodiff();
     let valid: Vec<f32> = (0..AREA).map(|i| f32::from(u8::from(i < count))).collect();
     let points: Vec<f32> =
         (0..AREA).flat_map(|i| if i < count { [0.5, -0.25, 2.0] } else { [f32::NAN, 1e30, 1e30] }).collect();
     let truth: Vec<f32> =
         (0..AREA).flat_map(|i| if i < count { [0.1, 0.05, 2.5] } else { [f32::NAN; 3] }).collect();
-    let predicted =
-        Tensor::<4>::from_data(TensorData::new(points, [1, SIDE, SIDE, 3]), &device).require_grad();
+    let predicted = tracked(points, [1, SIDE, SIDE, 3], device);
+    let device = predicted.device();
     let conf = Tensor::<3>::full([1, SIDE, SIDE], 0.5, &device);
     let map = PointMap { points: predicted.clone(), conf };
     let prediction = Prediction { window: Window::whole(SIDE), maps: vec![(View::Front, map)] };
@@ -124,8 +111,8 @@ fn point_loss(count: usize, device: &Device) -> Found {
     let gradient = host(predicted.grad(&all.backward()).expect("tracked"));
     let got = host(loss.regression)[0];
     let expected = if count > 0 { (0.4_f64 * 0.4 + 0.3 * 0.3 + 0.5 * 0.5).sqrt() } else { 0.0 };
-    Found { value: Some((f64::from(got) - expected).abs()), ..Found::default() }
-        .must(finite(&gradient), "a gradient is not finite")
+    Found { value: Some(apart(got, expected)), ..Found::default() }
+        .must(all_finite(&gradient), "a gradient is not finite")
         .must(gradient[3 * count..].iter().all(|g| *g == 0.0), "there is a gradient outside the mask")
         .must(count == 0 || gradient[..3].iter().any(|g| *g != 0.0), "there is no gradient inside the mask")
 }
@@ -135,15 +122,16 @@ fn constant_pictures(a: f32, b: f32, device: &Device) -> Found {
     let (height, width) = (24, 24);
     let flat = |v: f32| Tensor::<4>::full([1, 3, height, width], v, &device);
     let image = flat(a).require_grad();
-    let loss = Photometric::new(image.clone(), flat(b)).loss(0.8);
+    let [l1, ssim] = photometric(image.clone(), flat(b));
+    let loss = l1 * 0.8 + (-ssim + 1.0) * 0.2;
     let gradient = host(image.grad(&loss.backward()).expect("tracked"));
     let map = host(snapsnap_eval::similarity::ssim_gaussian(flat(a), flat(b)));
     let (a, b) = (f64::from(a), f64::from(b));
     let expected = (2.0 * a * b + 1e-4) / (a * a + b * b + 1e-4);
-    let middle = f64::from(map[width * height / 2 + width / 2]);
+    let middle = map[width * height / 2 + width / 2];
     let most = map.iter().fold(f32::MIN, |most, v| most.max(*v));
-    Found { value: Some((middle - expected).abs()), note: format!("largest {most}"), ..Found::default() }
-        .must(finite(&gradient), "a gradient is not finite")
+    Found { value: Some(apart(middle, expected)), note: format!("largest {most}"), ..Found::default() }
+        .must(all_finite(&gradient), "a gradient is not finite")
         .must(most <= 1.0, "a similarity is above 1")
 }
 
@@ -188,7 +176,7 @@ fn zero_gradients(device: &Device) -> Found {
         };
         let kept = if is_matrix { (1.0 - rate * decay).powi(STEPS as i32) } else { 1.0 };
         let (before, after) = (host(before[name].clone()), host(after[name].clone()));
-        all &= finite(&after);
+        all &= all_finite(&after);
         for (b, a) in before.iter().zip(&after) {
             worst = worst.max((f64::from(*a) - f64::from(*b) * kept).abs() / f64::from(b.abs()).max(1e-3));
         }
@@ -219,10 +207,10 @@ fn many_adamw_steps(steps: u64) -> Found {
         }
     }
     let got = host(values);
-    let off = |(got, expected): (&f32, &f64)| (f64::from(*got) - expected).abs() / expected.abs();
-    let worst = got.iter().zip(&expected).map(off).fold(0.0, f64::max);
-    Found { value: Some(worst), note: format!("weights {got:?}"), ..Found::default() }
-        .must(finite(&got), "a weight is not finite")
+    let off = |(got, expected): (&f32, &f64)| apart(*got, *expected) / expected.abs();
+    let value = Some(worst(got.iter().zip(&expected).map(off)));
+    Found { value, note: format!("weights {got:?}"), ..Found::default() }
+        .must(all_finite(&got), "a weight is not finite")
 }
 
 fn ends_of_the_rate() -> Found {

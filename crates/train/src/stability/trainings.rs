@@ -11,7 +11,7 @@ use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::prepare::DataConfig;
 use snapsnap_data::sample::Stage1Item;
 use snapsnap_eval::stability::{Case, Found};
-use snapsnap_net::weights::{Source, random_predictor, random_regressors};
+use snapsnap_net::weights::{random_predictor, random_regressors};
 use snapsnap_people::synth;
 use tempfile::TempDir;
 
@@ -44,8 +44,7 @@ pub(super) fn cases() -> Vec<Case> {
 
 /// A case that does not depend on the device.
 fn case(input: &str, holds: &str, run: impl Fn() -> Result<Found, TrainError> + 'static) -> Case {
-    let failed = |e: TrainError| Found { broken: Some(e.to_string()), ..Found::default() };
-    let run = move |_: &Device| run().unwrap_or_else(failed);
+    let run = move |_: &Device| run().unwrap_or_else(Found::broken);
     Case { area: "Stiff training", once: true, ..super::case(input, holds, 0.0, run) }
 }
 
@@ -67,7 +66,8 @@ impl Watch for Silent {
     fn note(&mut self, _: &str) {}
 }
 
-/// A short training in a temporary folder: its outcome, and whether all logged numbers and weights are finite.
+/// A short training in a temporary folder: its outcome, and whether all logged numbers are finite. Weights that
+/// are not finite cannot be written, which is an error.
 fn trained<T: Task>(
     task: &T,
     config: &TrainConfig,
@@ -86,10 +86,6 @@ fn trained<T: Task>(
     };
     let mut watch = Silent { finite: true };
     let outcome = on_best_thread(device, || train(task, config, networks, &options, &mut watch))?;
-    let weights = Source::open(&folder.path().join("last.safetensors"))?;
-    for name in weights.tensors().keys() {
-        watch.finite &= weights.read_f32(name)?.iter().all(|v| v.is_finite());
-    }
     Ok((outcome, watch.finite))
 }
 

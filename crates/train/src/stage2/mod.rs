@@ -1,7 +1,6 @@
 //! Stage 2: trains the regressor, and the point predictor if asked for, by comparing renders with target views
 //! (docs/method.md, "Losses of stage 2").
 
-mod frozen;
 mod scene;
 mod scores;
 
@@ -26,15 +25,13 @@ use crate::TrainError;
 use crate::config::{Stage1Config, Stage2Config, TrainConfig};
 use crate::data::Data;
 use crate::networks::Networks;
-use crate::photometric::Photometric;
 use crate::points::losses as points_losses;
 use crate::ranks::Ranks;
 use crate::task::{Moment, Part, Task, Validation};
 use snapsnap_eval::preview::{grid, heat, picture};
 
-use frozen::Frozen;
-pub use scene::anisotropy_penalty;
 use scene::{Phase, gaussians, targets};
+pub use scene::{anisotropy_penalty, photometric};
 use scores::Scores;
 
 /// β: the share of the L1 loss, as published. The rest is the share of the structural dissimilarity.
@@ -51,13 +48,15 @@ pub struct GaussianTask {
     /// Weights of the point loss.
     stage1: Stage1Config,
     seed: u64,
-    /// The predictor, unless it is trained as well.
-    frozen: Option<Frozen>,
+    /// The predictor, unless it is trained as well: in f32 for validations, in the training's precision for steps.
+    frozen: Option<[PointPredictor; 2]>,
     data: Data<Stage2Item>,
     /// Scores of the billboard baseline, computed once.
-    billboard_scores: OnceLock<Scores>,
+    billboard_scores: OnceLock<[f64; 4]>,
     /// With autodiff.
     device: Device,
+    /// The same without autodiff.
+    inner: Device,
 }
 
 impl GaussianTask {
@@ -76,54 +75,46 @@ impl GaussianTask {
         // Second surfaces are trained in stage 1 alone.
         let samples = SampleConfig { points, second_depth: false, ..config.samples() };
         let data = Data::new(folders, config, &samples, Stage2::new)?;
+        let in_both =
+            |predictor: PointPredictor| [predictor.clone(), config.training.precision.lower(predictor)];
         Ok(Self {
             config: config.networks(),
             loss_config: config.stage2.clone(),
             stage1: config.stage1.clone(),
             seed: config.training.seed,
-            frozen: predictor.map(|predictor| Frozen::new(config, predictor)),
+            frozen: predictor.map(in_both),
             data,
             billboard_scores: OnceLock::new(),
             device: device.clone(),
+            inner: device.clone().inner(),
         })
     }
 
     /// Points of a sample's photographs by the trained or the frozen predictor, in a step or a validation.
     fn predict(&self, networks: &Networks, item: &Stage2Item, is_step: bool) -> Prediction {
-        let inner = self.device.clone().inner();
         let (predictor, device) = match (&networks.predictor, &self.frozen) {
-            (Some(predictor), _) => (predictor, if is_step { &self.device } else { &inner }),
+            (Some(predictor), _) => (predictor, if is_step { &self.device } else { &self.inner }),
             (None, frozen) => {
                 let frozen = frozen.as_ref().expect("a predictor that is not trained is frozen");
-                (frozen.predictor(is_step), &inner)
+                (&frozen[usize::from(is_step)], &self.inner)
             }
         };
-        Prediction::of_pair(
-            predictor,
-            &self.config,
-            item.photographs.each_ref(),
-            device,
-            &mut Record::default(),
-        )
+        let photographs = item.photographs.each_ref();
+        Prediction::of_pair(predictor, &self.config, photographs, device, &mut Record::default())
     }
 
     /// Gaussians of all views, for validations.
-    fn whole(&self, networks: &Networks, item: &Stage2Item, device: &Device) -> Option<Gaussians> {
+    fn whole(&self, networks: &Networks, item: &Stage2Item) -> Option<Gaussians> {
         let prediction = self.predict(networks, item, false);
-        gaussians(&self.config, networks, item, prediction, &Phase::new(false, 0), device)
+        gaussians(&self.config, networks, item, prediction, &Phase::new(false, 0), &self.inner)
     }
 
     /// Renders all target views `[V,3,h,w]`. Without Gaussians the pictures show the background.
-    fn shown(
-        &self,
-        item: &Stage2Item,
-        gaussians: Option<Gaussians>,
-        device: &Device,
-    ) -> Result<Tensor<4>, TrainError> {
+    fn shown(&self, item: &Stage2Item, gaussians: Option<Gaussians>) -> Result<Tensor<4>, TrainError> {
         match gaussians {
             Some(gaussians) => Ok(self.render(&gaussians, &item.target_cameras, item.background)?.0),
             None => {
-                let color = Tensor::<1>::from_floats(item.background, device).reshape([1, 3, 1, 1]);
+                let color = Tensor::<1>::from_floats(item.background, &self.inner).reshape([1, 3, 1, 1]);
                 Ok(color.expand([item.target_cameras.len(), 3, item.target_side, item.target_side]))
             }
         }
@@ -132,25 +123,25 @@ impl GaussianTask {
     /// Scores of the billboard baseline: both photographs as flat cut-outs in the plane through the person's axis. Its
     /// points are the ray anchors, which lie on that plane. The last layer of a regressor with a geometric start is
     /// zero, so that random weights leave each Gaussian in its pixel's colour. Confidences of 0 leave the sides out.
-    fn billboard(&self, ranks: &Ranks) -> Result<Scores, TrainError> {
+    fn billboard(&self, ranks: &Ranks) -> Result<[f64; 4], TrainError> {
         if let Some(scores) = self.billboard_scores.get() {
             return Ok(*scores);
         }
-        let device = self.device.clone().inner();
+        let device = &self.inner;
         let mut config = self.config.clone();
         config.mode.compat = false;
         config.network.on_rays = false;
         config.regressor.start = Some(RegressorStart::Geometric);
-        let networks = Networks { predictor: None, regressors: random_regressors(&config, 0, &device) };
+        let networks = Networks { predictor: None, regressors: random_regressors(&config, 0, device) };
         let all = self.data.validated(ranks, |sums: &mut Scores, item| {
             let window = Window::whole(item.side);
             let map = |view: View| {
-                let points = anchors(view, self.config.network.pair_degrees, item.side, &window, &device);
-                (view, PointMap { conf: Tensor::zeros([1, item.side, item.side], &device), points })
+                let points = anchors(view, self.config.network.pair_degrees, item.side, &window, device);
+                (view, PointMap { conf: Tensor::zeros([1, item.side, item.side], device), points })
             };
             let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
-            let gaussians = gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), &device);
-            Ok(sums.add(&item, self.shown(&item, gaussians, &device)?, &device)?)
+            let gaussians = gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), device);
+            Ok(sums.add(&item, self.shown(&item, gaussians)?)?)
         })?;
         Ok(*self.billboard_scores.get_or_init(|| Scores::mean(&all)))
     }
@@ -217,9 +208,9 @@ impl Task for GaussianTask {
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
-            let photometric = Photometric::new(image, target);
-            add("l1", L1_SHARE, photometric.l1);
-            add("dissimilarity", 1.0 - L1_SHARE, 1.0 - photometric.ssim);
+            let [l1, ssim] = photometric(image, target);
+            add("l1", L1_SHARE, l1);
+            add("dissimilarity", 1.0 - L1_SHARE, 1.0 - ssim);
             if config.alpha_weight > 0.0 {
                 add("alpha", config.alpha_weight, mean((coverage - mask).abs()));
             }
@@ -241,36 +232,36 @@ impl Task for GaussianTask {
         if self.data.count == 0 {
             return Ok(None);
         }
-        let device = self.device.clone().inner();
         let all = self.data.validated(ranks, |sums: &mut Scores, item| {
-            let shown = self.shown(&item, self.whole(networks, &item, &device), &device)?;
-            Ok(sums.add(&item, shown, &device)?)
+            Ok(sums.add(&item, self.shown(&item, self.whole(networks, &item))?)?)
         })?;
-        let (scores, billboard) = (Scores::mean(&all), self.billboard(ranks)?);
+        let [full, masked, sides, ssim] = Scores::mean(&all);
+        let [_, billboard_masked, billboard_sides, _] = self.billboard(ranks)?;
         let figures = vec![
-            ("psnr_masked", scores.masked),
-            ("psnr_masked_sides", scores.sides),
-            ("psnr", scores.full),
-            ("ssim", scores.ssim),
-            ("billboard_psnr_masked", billboard.masked),
-            ("billboard_psnr_masked_sides", billboard.sides),
+            ("psnr_masked", masked),
+            ("psnr_masked_sides", sides),
+            ("psnr", full),
+            ("ssim", ssim),
+            ("billboard_psnr_masked", billboard_masked),
+            ("billboard_psnr_masked_sides", billboard_sides),
         ];
-        Ok(Some(Validation { score: -scores.masked, figures }))
+        Ok(Some(Validation { score: -masked, figures }))
     }
 
     fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
-        let device = self.device.clone().inner();
         let mut rows = Vec::new();
         for item in self.data.validation(PREVIEWS) {
             let item = item?;
             let (side, area) = (item.side, item.side * item.side);
             let photo = |view: usize| {
-                picture(side, |i| [0, 1, 2].map(|c| item.photographs[view].rgb[c * area + i] * 0.5 + 0.5))
+                picture([side; 2], |i| {
+                    [0, 1, 2].map(|c| item.photographs[view].rgb[c * area + i] * 0.5 + 0.5)
+                })
             };
             let mut row = vec![photo(0), photo(1)];
             let views = [0, item.target_cameras.len() - 2];
             let cameras = views.map(|v| item.target_cameras[v]);
-            let seen = match self.whole(networks, &item, &device) {
+            let seen = match self.whole(networks, &item) {
                 Some(gaussians) => host(self.render(&gaussians, &cameras, item.background)?.0),
                 None => vec![0.0; 2 * 3 * item.target_side.pow(2)],
             };
@@ -285,9 +276,9 @@ impl Task for GaussianTask {
                     (0..3).map(|c| (a[c] - b[c]).abs()).sum::<f32>() / 3.0
                 };
                 row.extend([
-                    picture(side, got),
-                    picture(side, truth),
-                    picture(side, |i| heat(error(i), WORST)),
+                    picture([side; 2], got),
+                    picture([side; 2], truth),
+                    picture([side; 2], |i| heat(error(i), WORST)),
                 ]);
             }
             rows.push(row);
@@ -298,6 +289,7 @@ impl Task for GaussianTask {
     }
 
     fn frozen(&self) -> BTreeMap<String, Vec<f32>> {
-        self.frozen.as_ref().map_or_else(BTreeMap::new, |frozen| frozen.networks.checkpoint())
+        let predictor = self.frozen.as_ref().map(|[whole, _]| whole.clone());
+        Networks { predictor, regressors: Vec::new() }.checkpoint()
     }
 }

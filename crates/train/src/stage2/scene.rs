@@ -1,9 +1,10 @@
-//! The Gaussians of a sample, and their targets.
+//! The Gaussians of a sample, their targets, and differences from the targets.
 
 use std::ops::Range;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_data::sample::Stage2Item;
+use snapsnap_eval::similarity::ssim_gaussian;
 use snapsnap_net::config::Config;
 use snapsnap_net::network::View;
 use snapsnap_net::painter::{Painted, Painter};
@@ -92,6 +93,12 @@ pub fn anisotropy_penalty(scales: &Tensor<2>, limit: f64) -> Tensor<1> {
     let logs = scales.clone().clamp_min(1e-12).log();
     let ratio = logs.clone().max_dim(1) - logs.min_dim(1);
     mean((ratio - limit.ln()).clamp_min(0.0))
+}
+
+/// Mean absolute difference and mean structural similarity, each `[1]`, of pictures `[B,C,H,W]` with values in [0, 1].
+pub fn photometric(image: Tensor<4>, target: Tensor<4>) -> [Tensor<1>; 2] {
+    let l1 = mean((image.clone() - target.clone()).abs());
+    [l1, mean(ssim_gaussian(image, target))]
 }
 
 #[cfg(test)]

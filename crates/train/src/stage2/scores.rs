@@ -1,32 +1,28 @@
 //! Scores of rendered pictures.
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 use snapsnap_data::sample::Stage2Item;
 use snapsnap_eval::EvalError;
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
-use snapsnap_eval::similarity::SquaredError;
-use snapsnap_ops::host;
+use snapsnap_eval::similarity::{SquaredError, ssim_gaussian};
+use snapsnap_ops::{host, mean};
 
 use super::scene::targets;
-use crate::photometric::Photometric;
 
-/// Scores of pictures, as sums or means over samples.
-#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
+/// Scores of pictures, as sums over samples.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(super) struct Scores {
     samples: f64,
-    /// PSNR in dB of whole pictures, of the person with a margin, and of the person in the two sides.
-    pub full: f64,
-    pub masked: f64,
-    pub sides: f64,
-    pub ssim: f64,
+    /// PSNR in dB of whole pictures, of the person with a margin, and of the person in the two sides; SSIM.
+    sums: [f64; 4],
 }
 
 impl Scores {
-    pub fn add(&mut self, item: &Stage2Item, image: Tensor<4>, device: &Device) -> Result<(), EvalError> {
+    pub fn add(&mut self, item: &Stage2Item, image: Tensor<4>) -> Result<(), EvalError> {
         let (count, side) = (item.target_cameras.len(), item.target_side);
-        let (target, _) = targets(item, &(0..count).collect::<Vec<_>>(), device);
+        let (target, _) = targets(item, &(0..count).collect::<Vec<_>>(), &image.device());
         // Files and screens clamp values outside [0, 1].
         let shown = host(image.clone().clamp(0.0, 1.0));
         let [mut full, mut masked, mut sides] = [SquaredError::default(); 3];
@@ -46,24 +42,15 @@ impl Scores {
             }
         }
         self.samples += 1.0;
-        self.full += full.psnr();
-        self.masked += masked.psnr();
-        self.sides += sides.psnr();
-        self.ssim += f64::from(host(Photometric::new(image, target).ssim)[0]);
+        let ssim = f64::from(host(mean(ssim_gaussian(image, target)))[0]);
+        let scores = [full.psnr(), masked.psnr(), sides.psnr(), ssim];
+        self.sums.iter_mut().zip(scores).for_each(|(sum, score)| *sum += score);
         Ok(())
     }
 
     /// Means over the samples of all sums.
-    pub fn mean(all: &[Self]) -> Self {
-        let sum = |of: fn(&Self) -> f64| all.iter().map(of).sum::<f64>();
-        let samples = sum(|scores| scores.samples);
-        let mean = |of| sum(of) / samples;
-        Self {
-            samples: 1.0,
-            full: mean(|scores| scores.full),
-            masked: mean(|scores| scores.masked),
-            sides: mean(|scores| scores.sides),
-            ssim: mean(|scores| scores.ssim),
-        }
+    pub fn mean(all: &[Self]) -> [f64; 4] {
+        let samples = all.iter().map(|scores| scores.samples).sum::<f64>();
+        std::array::from_fn(|i| all.iter().map(|scores| scores.sums[i]).sum::<f64>() / samples)
     }
 }

@@ -24,19 +24,9 @@ use crate::say;
 const MAX_SUBJECTS: usize = 1_000_000;
 
 #[derive(Args)]
-pub struct SynthArguments {
-    #[command(flatten)]
-    common: Common,
-    #[command(flatten)]
-    generate: Generate,
-}
-
-#[derive(Args)]
 pub struct MakehumanArguments {
     /// MakeHuman's folder `data`, or a checkout that contains it.
     folder: PathBuf,
-    #[command(flatten)]
-    common: Common,
     #[command(flatten)]
     generate: Generate,
 }
@@ -47,14 +37,14 @@ pub struct AvatarsArguments {
     /// last `_` show one person. Of nine people, one is for test and one for val.
     folder: PathBuf,
     #[command(flatten)]
-    common: Common,
-    #[command(flatten)]
     generate: Generate,
 }
 
 /// Options of the commands that generate people.
 #[derive(Args)]
-struct Generate {
+pub struct Generate {
+    #[command(flatten)]
+    common: Common,
     /// Number of people.
     #[arg(long, value_name = "N", default_value_t = 100)]
     subjects: usize,
@@ -70,18 +60,17 @@ struct Generate {
     save_scans: bool,
 }
 
-pub fn synth(SynthArguments { common, generate }: &SynthArguments) -> Result<(), Failure> {
-    generate.run(common, "synth", &[], |name, poses| Ok(synth::person(name, poses)))
+pub fn synth(generate: &Generate) -> Result<(), Failure> {
+    generate.run("synth", &[], |name, poses| Ok(synth::person(name, poses)))
 }
 
 pub fn makehuman(arguments: &MakehumanArguments) -> Result<(), Failure> {
     let library = Library::open(&arguments.folder)?;
     let person = |name: &str, poses: Option<&Poses>| makehuman::person(&library, name, poses);
-    arguments.generate.run(&arguments.common, "makehuman", &[library.root()], person)
+    arguments.generate.run("makehuman", &[library.root()], person)
 }
 
-pub fn avatars(arguments: &AvatarsArguments) -> Result<(), Failure> {
-    let AvatarsArguments { folder, common, generate } = arguments;
+pub fn avatars(AvatarsArguments { folder, generate }: &AvatarsArguments) -> Result<(), Failure> {
     let avatars = Avatars::open(folder, |person| match person % 9 {
         0 => generate.split == Split::Test,
         4 => generate.split == Split::Val,
@@ -93,7 +82,7 @@ pub fn avatars(arguments: &AvatarsArguments) -> Result<(), Failure> {
         animated.set(animated.get() + usize::from(has_animations));
         Ok(mesh)
     };
-    let made = generate.run(common, "avatars", &[folder], person);
+    let made = generate.run("avatars", &[folder], person);
     if animated.get() > 0 {
         say::note(&format!(
             "{} subjects come from files with morph targets or animations, which were ignored",
@@ -107,11 +96,11 @@ impl Generate {
     /// Generates people from their names.
     fn run(
         &self,
-        common: &Common,
         kind: &str,
         inputs: &[&Path],
         person: impl Fn(&str, Option<&Poses>) -> Result<Mesh, FileError>,
     ) -> Result<(), Failure> {
+        let Self { common, split, .. } = self;
         if self.subjects == 0 || self.subjects > MAX_SUBJECTS {
             bail!("--subjects is {}, must be 1 to {MAX_SUBJECTS}", self.subjects);
         }
@@ -122,10 +111,9 @@ impl Generate {
         let poses = self.poses.as_deref().map(standing).transpose()?;
         let mut inputs = inputs.to_vec();
         inputs.extend(self.poses.as_deref());
-        let split = self.split;
         let works: Vec<Work> = (0..self.subjects)
             .map(|index| Work {
-                split,
+                split: *split,
                 subject: format!("{index:04}"),
                 identity: format!("{kind}/{}/{split}/{index}", common.seed),
             })

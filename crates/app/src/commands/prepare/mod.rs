@@ -1,8 +1,6 @@
-//! `snapsnap prepare`: renders data sets of scanned or generated people.
+//! `snapsnap prepare`: renders data sets of scanned or generated people, checks and packs data sets.
 
-mod check;
 mod generate;
-mod pack;
 mod preview;
 mod scan;
 
@@ -16,7 +14,7 @@ use snapsnap_base::config::{Schema, differences, keys};
 use snapsnap_base::file;
 use snapsnap_base::random::stream;
 use snapsnap_data::Shard;
-use snapsnap_data::dataset::{Folder, Made, Split};
+use snapsnap_data::dataset::{self, Folder, Made, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::Mesh;
@@ -46,7 +44,7 @@ enum Kind {
     #[command(
         after_help = "Example: snapsnap prepare synth --subjects 300 --seed 1 --config configs/data/small.toml -o people/synth"
     )]
-    Synth(generate::SynthArguments),
+    Synth(generate::Generate),
     /// Make people from MakeHuman's free data.
     #[command(
         after_help = "Example: snapsnap prepare makehuman path/to/makehuman/data --subjects 300 --seed 2 -o people/makehuman"
@@ -59,10 +57,10 @@ enum Kind {
     Avatars(generate::AvatarsArguments),
     /// List the faults of a data set.
     #[command(after_help = "Example: snapsnap prepare check people/synth")]
-    Check(check::Arguments),
+    Check(CheckArguments),
     /// Pack a data set into tar archives, which a training reads without unpacking them.
     #[command(after_help = "Example: snapsnap prepare pack people/synth -o packed/synth")]
-    Pack(pack::Arguments),
+    Pack(PackArguments),
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
@@ -71,9 +69,62 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         Kind::Synth(arguments) => generate::synth(arguments),
         Kind::Makehuman(arguments) => generate::makehuman(arguments),
         Kind::Avatars(arguments) => generate::avatars(arguments),
-        Kind::Check(arguments) => check::run(arguments),
-        Kind::Pack(arguments) => pack::run(arguments),
+        Kind::Check(arguments) => check(arguments),
+        Kind::Pack(arguments) => pack(arguments),
     }
+}
+
+#[derive(Args)]
+struct CheckArguments {
+    /// Folder of the data set, in this program's layout or in that of the authors' tools.
+    dataset: PathBuf,
+}
+
+fn check(arguments: &CheckArguments) -> Result<(), Failure> {
+    let progress = Progress::steps(0, "subjects");
+    let checked = dataset::check(&arguments.dataset, |done, all| progress.step(done, all, "subjects"))?;
+    drop(progress);
+    for problem in &checked.problems {
+        say::out(problem);
+    }
+    let looked = format!("{} subjects, {} views", checked.subjects, checked.views);
+    if !checked.problems.is_empty() {
+        return Err(Failure::Input(format!("{looked}: {} faults", checked.problems.len())));
+    }
+    say::info(&format!("{looked}: no fault"));
+    Ok(())
+}
+
+#[derive(Args)]
+struct PackArguments {
+    /// Folder of the data set.
+    dataset: PathBuf,
+    /// New folder for the archives. It can be used wherever a data set is asked for.
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Megabytes of an archive, about. Subjects are not divided.
+    #[arg(long, value_name = "MB", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    archive_size: u64,
+}
+
+fn pack(arguments: &PackArguments) -> Result<(), Failure> {
+    let folder = Folder::open(&arguments.dataset)?;
+    outside_data(&arguments.output, [arguments.dataset.as_path()])?;
+    let progress = Progress::steps(0, "subjects");
+    let size = 1_000_000 * arguments.archive_size;
+    let packed = dataset::pack(&folder, &arguments.output, size, |done, all| {
+        progress.step(done, all, "subjects");
+    })?;
+    drop(progress);
+    let megabytes = packed.bytes as f64 / 1e6;
+    say::info(&format!(
+        "{}: {} subjects, {} files in {} archives of {megabytes:.1} MB together",
+        arguments.output.display(),
+        packed.subjects,
+        packed.files,
+        packed.archives
+    ));
+    Ok(())
 }
 
 const SPLITS: [(&str, &str, Split); 3] = [

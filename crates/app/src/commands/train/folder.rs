@@ -11,6 +11,7 @@ use snapsnap_train::log::PREVIEWS;
 use snapsnap_train::run::{CONFIG, FILES, STATE};
 
 use super::Arguments;
+use crate::arguments::check_utf8;
 use crate::failure::Failure;
 use crate::output::{make_folder, outside_data};
 
@@ -31,10 +32,8 @@ pub fn config(arguments: &Arguments) -> Result<TrainConfig, Failure> {
     let paths = config.data.folders.iter_mut().chain(config.training.weights.iter_mut());
     for path in paths {
         *path = std::path::absolute(&*path).unwrap_or_else(|_| path.clone());
-        if path.to_str().is_none() {
-            return Err(Failure::file(path, "the path is not UTF-8, which the run's config must be"));
-        }
     }
+    check_utf8(config.data.folders.iter().chain(&config.training.weights))?;
     Ok(config)
 }
 

@@ -3,7 +3,6 @@
 mod folder;
 mod report;
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -26,6 +25,7 @@ use snapsnap_train::stage2::GaussianTask;
 use snapsnap_train::task::Task;
 
 use super::evaluate::check_data;
+use crate::batch::unpanicked;
 use crate::failure::{Failure, bail};
 use crate::{device, interrupt, memory, say};
 
@@ -97,18 +97,16 @@ pub fn stage2(arguments: &Arguments) -> Result<ExitCode, Failure> {
 /// Runs `work` as one of the ranks of MPI, if a launcher started several. The failure of one rank ends all ranks.
 fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result<ExitCode, Failure> {
     let ranks = Ranks::join().map_err(Failure::Input)?;
-    if ranks.size() == 1 {
+    if ranks.size == 1 {
         return work(&ranks);
     }
     if !ranks.is_first() {
         say::set_quiet(true);
     }
     // A panic must end the others as well, which would wait for this rank.
-    let done = catch_unwind(AssertUnwindSafe(|| work(&ranks)));
-    let failure = match done {
-        Ok(Ok(code)) => return Ok(code),
-        Ok(Err(failure)) => failure,
-        Err(_) => Failure::Internal("a bug in this program; its message is above".into()),
+    let failure = match unpanicked(|| work(&ranks)) {
+        Ok(code) => return Ok(code),
+        Err(failure) => failure,
     };
     // A failure of all ranks is printed once, since the first rank ends the others meanwhile.
     if !ranks.is_first() {
@@ -116,7 +114,7 @@ fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result
     }
     let message = failure.to_string();
     let is_named = message.starts_with("rank ");
-    let whose = if is_named { String::new() } else { format!("rank {} on {}: ", ranks.rank(), ranks.host()) };
+    let whose = if is_named { String::new() } else { format!("rank {} on {}: ", ranks.rank, ranks.host) };
     say::err(&format!("error: {whose}{message}"));
     file::remove_unfinished();
     ranks.abort(failure.code());
@@ -127,7 +125,7 @@ fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     let mut plan = Plan::new(arguments, ranks)?;
     plan.keep_start();
     let task = PointTask::new(&plan.folders, &plan.config, &plan.device)?;
-    plan.check_validation(task.validation_samples());
+    plan.check_validation(task.data().count);
     plan.run(&task, |tracked| {
         let networks = plan.config.networks();
         // The state of a continued run contains its weights.
@@ -162,7 +160,7 @@ fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     let frozen = weights.as_ref().filter(|_| !joint);
     let frozen = frozen.map(|weights| weights.point_predictor(&plan.device.clone().inner())).transpose()?;
     let task = GaussianTask::new(&plan.folders, &plan.config, frozen, &plan.device)?;
-    plan.check_validation(task.validation_samples());
+    plan.check_validation(task.data().count);
     plan.run(&task, |tracked| {
         let (networks, seed) = (plan.config.networks(), plan.config.training.seed);
         let regressors = match weights.as_ref().filter(|weights| weights.require(Part::Regressor).is_ok()) {
@@ -193,20 +191,20 @@ impl<'a> Plan<'a> {
         check_data(&config.data.folders)?;
         let folders = config.data.folders.iter().map(|path| Folder::open(path).map(Arc::new));
         let folders = folders.collect::<Result<_, _>>()?;
-        let device = if ranks.size() == 1 {
+        let device = if ranks.size == 1 {
             device::choose(&arguments.device)?
         } else {
-            device::choose_in_turn(&arguments.device, ranks.local())?
+            device::choose_in_turn(&arguments.device, ranks.local)?
         };
-        if ranks.size() > config.training.batch {
-            let (count, batch) = (ranks.size(), config.training.batch);
+        if ranks.size > config.training.batch {
+            let (count, batch) = (ranks.size, config.training.batch);
             bail!("`training.batch` is {batch}, must be at least {count}, the number of ranks");
         }
         // Ranks on one machine share its memory.
-        let hosts = ranks.gather(&ranks.host().to_owned());
+        let hosts = ranks.gather(&ranks.host);
         if memory::is_cpu(&device) {
-            let neighbours = hosts.iter().filter(|host| *host == ranks.host()).count() as u64;
-            let needed = neighbours * least_memory(&config, ranks.size());
+            let neighbours = hosts.iter().filter(|host| **host == ranks.host).count() as u64;
+            let needed = neighbours * least_memory(&config, ranks.size);
             memory::check("this training", needed, "a smaller network or training.batch needs less")?;
         }
         // The first rank is about to write a state, which later ranks would find.
@@ -272,7 +270,7 @@ impl<'a> Plan<'a> {
             let trained = run::train(task, &self.config, networks(tracked)?, &options, &mut reporter);
             // With several ranks a full disk is a failure of the job.
             trained.map_err(|e| match e.into() {
-                Failure::Write(message) if ranks.size() > 1 => Failure::Internal(message),
+                Failure::Write(message) if ranks.size > 1 => Failure::Internal(message),
                 failure => failure,
             })
         })?;

@@ -1,16 +1,15 @@
 //! Progress of a training on the terminal.
 
-use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::log::Line;
 use snapsnap_train::run::{Rehearsal, Watch};
 use snapsnap_train::task::Validation;
 
-use crate::{device, memory, say};
+use crate::{device, memory, progress, say};
 
 /// Seconds between two plain lines.
 const PAUSE: Duration = Duration::from_secs(10);
@@ -27,13 +26,8 @@ pub struct Reporter {
 
 impl Reporter {
     pub fn new(config: &TrainConfig, limit: Option<Duration>) -> Self {
-        let bar = (!say::is_quiet() && std::io::stderr().is_terminal()).then(|| {
-            let bar = ProgressBar::new(config.training.steps as u64);
-            let style =
-                ProgressStyle::with_template("{bar:20} {pos}/{len} {wide_msg}").expect("a valid template");
-            bar.set_style(style);
-            bar
-        });
+        let bar = ProgressBar::new(config.training.steps as u64);
+        let bar = progress::shown(bar, "{bar:20} {pos}/{len} {wide_msg}");
         Self { bar, start: Instant::now(), limit, first: None, printed: None }
     }
 

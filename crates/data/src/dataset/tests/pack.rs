@@ -54,7 +54,7 @@ fn a_packed_set_is_read_as_its_folders() {
             pack(&packed, &temporary.path().join("third"), 1, |_, _| {}).expect_err("packed").to_string();
         assert!(refused.contains("packed already"), "{refused}");
         let refused = pack(&folder, &again, 1, |_, _| {}).expect_err("there").to_string();
-        assert!(refused.contains("again_64_4: is not empty"), "{refused}");
+        assert!(refused.contains("again_64_4: is not empty; give another folder"), "{refused}");
         let refused = Folder::create(&again, folder.description().clone()).expect_err("packed").to_string();
         assert!(refused.contains("is packed"), "{refused}");
         let left: Vec<_> =
@@ -140,6 +140,9 @@ fn broken_archives_and_indices_are_refused_by_name() {
     let missing = check(root, |_, _| {}).expect("checks").problems;
     assert_eq!(missing.len(), 1, "{missing:?}");
     assert!(missing[0].contains("archives.csv: lists no train/depth/0001/3.npz"), "{missing:?}");
+    // A killed run leaves no description.
+    fs::remove_file(root.join(DESCRIPTION)).expect("removes");
+    assert!(refused().contains("is no data set: it has no dataset.toml"), "{}", refused());
 }
 
 /// Position of a member in its archive.
@@ -166,15 +169,4 @@ fn a_subject_without_a_file_or_with_a_full_stop_is_not_packed() {
     let left: Vec<_> =
         fs::read_dir(temporary.path()).expect("lists").map(|e| e.expect("entry").path()).collect();
     assert_eq!(left, [folder.root()], "nothing is left of it");
-}
-
-/// What a killed run has left is no data set, and no run adds to it.
-#[test]
-fn what_a_killed_run_has_left_is_refused() {
-    let (_temporary, folder, packed) = packed(Layout::Exact);
-    fs::remove_file(packed.root().join(DESCRIPTION)).expect("removes");
-    let refused = Folder::open(packed.root()).expect_err("refused").to_string();
-    assert!(refused.contains("is no data set: it has no dataset.toml"), "{refused}");
-    let refused = pack(&folder, packed.root(), 1, |_, _| {}).expect_err("refused").to_string();
-    assert!(refused.contains("is not empty; give another folder"), "{refused}");
 }

@@ -1,10 +1,8 @@
-mod depth;
 mod groups;
 mod second;
 
 use std::collections::HashSet;
 
-use burn::data::dataloader::batcher::Batcher;
 use burn::data::dataset::Dataset;
 use burn::tensor::Device;
 use glam::{DVec2, Vec3};
@@ -12,7 +10,7 @@ use snapsnap_photo::on_canvas;
 use snapsnap_splat::RigidTransform;
 
 use super::*;
-use crate::dataset::Layout;
+use crate::dataset::{DepthMap, Layout};
 use crate::testing::{BLOCK, block, data_set, off_block, person, rectangle};
 
 const TRAIN: Option<Split> = Some(Split::Train);
@@ -34,6 +32,46 @@ fn front_of(item: &Stage1Item) -> usize {
 fn there(points: &[f32], valid: &[f32], map: usize, side: usize) -> Vec<Vec3> {
     let (points, valid) = (&points[3 * map * side * side..], &valid[map * side * side..][..side * side]);
     points_of(points).zip(valid).filter(|(_, valid)| **valid > 0.5).map(|(point, _)| point).collect()
+}
+
+/// The world points of a view.
+fn world(folder: &Folder, view: usize, compat: bool) -> Vec<Vec3> {
+    let stored = folder.person(TRAIN, "0000").depth(view).expect("reads");
+    let camera = if compat { stored.camera } else { folder.exact_camera(&stored.camera) };
+    let map = DepthMap { camera, ..stored };
+    map.points(&RigidTransform::IDENTITY).flatten().map(|p| p.as_vec3()).collect()
+}
+
+/// Every point of every view of a plane lies on the plane.
+#[test]
+fn points_lie_on_the_surface_that_was_rendered() {
+    let (mesh, normal) = rectangle();
+    for (layout, bound) in [(Layout::Exact, 2e-6), (Layout::Authors, 1.5e-4)] {
+        let (_temporary, folder) = data_set(&mesh, layout, 128, 8, false, 1);
+        let mut worst = 0.0_f32;
+        for view in [0, 1, 4, 7] {
+            for p in world(&folder, view, false) {
+                worst = worst.max((normal.dot(p) - 0.9).abs() / normal.length());
+            }
+        }
+        println!("{layout:?}: {worst:e} m");
+        assert!(worst < bound, "{layout:?}: {worst} m");
+    }
+}
+
+/// In the published code, the points of the authors' layout are half a pixel off, to the right and down.
+#[test]
+fn published_points_are_half_a_pixel_off() {
+    let (_temporary, folder) = data_set(&rectangle().0, Layout::Authors, 128, 8, false, 1);
+    for view in [0, 2] {
+        let camera = folder.person(TRAIN, "0000").camera(view).expect("reads");
+        for (exact, published) in world(&folder, view, false).into_iter().zip(world(&folder, view, true)) {
+            let shift = camera.world_to_camera.rotation * (published - exact).as_dvec3();
+            let depth = camera.world_to_camera.apply(exact.as_dvec3()).z;
+            let expected = (0.5 * depth / camera.focal).extend(0.0);
+            assert!((shift - expected).length() < 1e-5, "view {view}: {shift} {expected}");
+        }
+    }
 }
 
 #[test]
@@ -195,17 +233,6 @@ fn test_samples_are_the_given_views() {
     }
 }
 
-#[test]
-fn stage_one_is_loaded_in_batches() {
-    let (_temporary, folder) = data_set(person(), Layout::Exact, 64, 8, false, 2);
-    let config = SampleConfig { repeat: 3, ..SampleConfig::default() };
-    let loader = Loader::new(stage1(&folder, config), 4, 2, 1).shuffled(1);
-    let batches =
-        loader.batches(0, 0).map(|items| Stage1Batcher.batch(items.expect("loads"), &Device::flex()));
-    let shapes: Vec<[usize; 5]> = batches.map(|batch| batch.points.dims()).collect();
-    assert_eq!(shapes, [[4, 4, 64, 64, 3], [2, 4, 64, 64, 3]]);
-}
-
 /// The second photograph and its points come from the neighbouring view. Its points are in the frame of the first view.
 /// Faces that a camera sees at a small angle have larger errors.
 #[test]
@@ -240,59 +267,75 @@ fn samples_of_neighbours_have_the_photograph_around_the_person() {
 
 #[test]
 fn contradictions_are_refused() {
-    let (_temporary, folder) = data_set(&rectangle().0, Layout::Exact, 16, 6, false, 1);
-    let message = |config: SampleConfig| {
-        Stage1::new(folder.clone(), TRAIN, config).map(drop).expect_err("refused").to_string()
-    };
-    let compat = SampleConfig { compat: true, ..SampleConfig::default() };
-    assert!(message(compat).contains("`augment`: must be off with `mode.compat = true`"));
-    assert!(message(SampleConfig::default()).contains("6 views"));
-    let (_temporary, ring) = data_set(&rectangle().0, Layout::Exact, 16, 4, false, 1);
+    let of_views = |views: usize| data_set(&rectangle().0, Layout::Exact, 16, views, false, 1);
+    let ours = SampleConfig::default();
+    let neighbours = SampleConfig { pair_degrees: 72.0, augment: Augment::none(), ..ours.clone() };
+    let cases = [
+        (
+            6,
+            SampleConfig { compat: true, ..ours.clone() },
+            "`augment`: must be off with `mode.compat = true`",
+        ),
+        (6, ours.clone(), "6 views"),
+        (8, neighbours.clone(), "two that are 72° apart"),
+        (
+            8,
+            SampleConfig { placed_share: 0.3, upright: true, ..neighbours },
+            "`placed_share`: must be 0 unless `network.pair_degrees` is 180",
+        ),
+        (
+            4,
+            SampleConfig { second_depth: true, ..ours },
+            "has no second surfaces, which `network.second_layer` needs",
+        ),
+    ];
+    for (views, config, expected) in cases {
+        let (_temporary, folder) = of_views(views);
+        let refused = Stage1::new(folder, TRAIN, config).map(drop).expect_err(expected).to_string();
+        assert!(refused.contains(expected), "{refused}");
+    }
+    let (_temporary, folder) = of_views(4);
     let refused =
-        Stage2::new(ring, TRAIN, SampleConfig::compat()).expect_err("has no large views").to_string();
+        Stage2::new(folder, TRAIN, SampleConfig::compat()).expect_err("has no large views").to_string();
     assert!(refused.contains("no views at twice the side"), "{refused}");
-    let (_temporary, folder) = data_set(&rectangle().0, Layout::Exact, 16, 8, false, 1);
-    let neighbours = SampleConfig { pair_degrees: 72.0, augment: Augment::none(), ..SampleConfig::default() };
-    let message = |config: SampleConfig| {
-        Stage1::new(folder.clone(), TRAIN, config).map(drop).expect_err("refused").to_string()
-    };
-    assert!(message(neighbours.clone()).contains("two that are 72° apart"));
-    let placed = SampleConfig { placed_share: 0.3, upright: true, ..neighbours };
-    assert!(message(placed).contains("`placed_share`: must be 0 unless `network.pair_degrees` is 180"));
 }
 
-/// Points of a mirrored sample belong to the mirrored pixels.
+/// Points of a mirrored sample belong to the mirrored pixels. The sides change places.
 #[test]
 fn mirrored_samples_are_those_of_a_mirrored_person() {
-    let (_temporary, folder) = data_set(person(), Layout::Exact, 64, 4, false, 1);
-    let config = |mirror| SampleConfig {
-        augment: Augment { flip: mirror, ..Augment::none() },
-        front_within_degrees: 0.0,
-        ..SampleConfig::default()
-    };
-    let [plain, mirrored] = [false, true].map(|mirror| stage1(&folder, config(mirror)));
-    let (mut same, mut turned) = (0, 0);
-    let area = 64 * 64;
-    for index in 0..12 {
-        let (a, b) = (plain.sample(index).expect("reads"), mirrored.sample(index).expect("reads"));
-        if a.points == b.points {
-            same += 1;
-            continue;
-        }
-        turned += 1;
-        for (view, other) in [(0, 0), (1, 1), (2, 3), (3, 2)] {
-            for i in 0..area {
-                let j = i / 64 * 64 + 63 - i % 64;
-                let at = |points: &[f32], pixel: usize| Vec3::from_slice(&points[3 * pixel..]);
-                let point = at(&a.points, view * area + i) * Vec3::new(-1.0, 1.0, 1.0);
-                assert_eq!(at(&b.points, other * area + j), point, "view {view}, pixel {i}");
-                assert_eq!(a.valid[view * area + i], b.valid[other * area + j]);
-                if view < 2 {
-                    assert_eq!(a.masks[view * area + i], b.masks[view * area + j]);
-                    assert_eq!(a.images[3 * view * area + i], b.images[3 * view * area + j]);
+    let one = data_set(person(), Layout::Exact, 64, 4, false, 1);
+    for ((_temporary, folder), second_depth) in [(one, false), (second::data_of_armed(64), true)] {
+        let config = |mirror| SampleConfig {
+            augment: Augment { flip: mirror, ..Augment::none() },
+            front_within_degrees: 0.0,
+            second_depth,
+            ..SampleConfig::default()
+        };
+        let [plain, mirrored] = [false, true].map(|mirror| stage1(&folder, config(mirror)));
+        let (mut same, mut turned) = (0, 0);
+        let area = 64 * 64;
+        for index in 0..12 {
+            let (a, b) = (plain.sample(index).expect("reads"), mirrored.sample(index).expect("reads"));
+            if a.points == b.points {
+                same += 1;
+                continue;
+            }
+            turned += 1;
+            let others = [0, 1, 3, 2, 5, 4].into_iter().take(a.valid.len() / area);
+            for (view, other) in others.enumerate() {
+                for i in 0..area {
+                    let j = i / 64 * 64 + 63 - i % 64;
+                    let at = |points: &[f32], pixel: usize| Vec3::from_slice(&points[3 * pixel..]);
+                    let point = at(&a.points, view * area + i) * Vec3::new(-1.0, 1.0, 1.0);
+                    assert_eq!(at(&b.points, other * area + j), point, "view {view}, pixel {i}");
+                    assert_eq!(a.valid[view * area + i], b.valid[other * area + j]);
+                    if view < 2 {
+                        assert_eq!(a.masks[view * area + i], b.masks[view * area + j]);
+                        assert_eq!(a.images[3 * view * area + i], b.images[3 * view * area + j]);
+                    }
                 }
             }
         }
+        assert!(same > 1 && turned > 1, "{same} and {turned}");
     }
-    assert!(same > 1 && turned > 1, "{same} and {turned}");
 }

@@ -236,7 +236,7 @@ fn figures(intervals: &[Option<Interval>; 3]) -> Value {
 
 /// Means over people and turns: distance in mm, distance after centring in mm, share of missed points.
 fn point_means(judged: &Judged, view: usize) -> Option<[f64; 3]> {
-    let errors = || judged.points.iter().flat_map(|(_, errors)| errors).filter(|error| error.view == view);
+    let errors = || judged.points.iter().filter(|error| error.view == view);
     let over = |of: fn(&PointError) -> f64| mean(&errors().map(of).collect::<Vec<_>>());
     Some([over(|e| 1e3 * e.mean)?, over(|e| 1e3 * e.centred)?, over(|e| e.missed)?])
 }

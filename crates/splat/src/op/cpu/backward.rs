@@ -271,25 +271,17 @@ fn gather(
     for (i, splat) in view.splats.iter().enumerate() {
         splat_of[splat.gaussian as usize] = i as u32;
     }
+    let widths = Inputs { means: 3, rotations: 4, scales: 3, opacities: 1, colors: 3 };
     // No chunk for an unwanted gradient.
-    let mut means = gradients.means.as_deref_mut().unwrap_or_default().chunks_mut(3 * CHUNK);
-    let mut rotations = gradients.rotations.as_deref_mut().unwrap_or_default().chunks_mut(4 * CHUNK);
-    let mut scales = gradients.scales.as_deref_mut().unwrap_or_default().chunks_mut(3 * CHUNK);
-    let mut opacities = gradients.opacities.as_deref_mut().unwrap_or_default().chunks_mut(CHUNK);
-    let mut colors = gradients.colors.as_deref_mut().unwrap_or_default().chunks_mut(3 * CHUNK);
+    let mut chunks = gradients.as_mut().with(widths, |gradient, width| {
+        gradient.as_deref_mut().unwrap_or_default().chunks_mut(width * CHUNK)
+    });
     let tasks: Vec<_> = splat_of
         .chunks(CHUNK)
-        .map(|splats| {
-            let geometry = [
-                means.next().unwrap_or_default(),
-                rotations.next().unwrap_or_default(),
-                scales.next().unwrap_or_default(),
-            ];
-            (splats, geometry, opacities.next().unwrap_or_default(), colors.next().unwrap_or_default())
-        })
+        .map(|splats| (splats, chunks.as_mut().map(|chunks| chunks.next().unwrap_or_default())))
         .collect();
     let camera = &job.views[index];
-    tasks.into_par_iter().for_each(|(splats, [means, rotations, scales], opacities, colors)| {
+    tasks.into_par_iter().for_each(|(splats, out)| {
         for (i, &at) in splats.iter().enumerate() {
             if at == u32::MAX {
                 continue;
@@ -301,32 +293,25 @@ fn gather(
             for &place in &view.lists.places[places] {
                 sums.add(records, place as usize * record.len(), record);
             }
-            if record.colors {
-                add(colors, 3 * i, &[sums.color.x, sums.color.y, sums.color.z]);
-            }
-            if !opacities.is_empty() {
-                opacities[i] += sums.opacity * splat.compensation;
-            }
+            add(out.colors, i, [sums.color.x, sums.color.y, sums.color.z]);
+            add(out.opacities, i, [sums.opacity * splat.compensation]);
             if record.geometry {
                 let gaussian = scene.gaussian(splat.gaussian as usize);
                 let v_compensation =
                     if job.options.antialiased { sums.opacity * gaussian.opacity } else { 0.0 };
                 let p = projection(&gaussian, camera, job);
                 let v = project_vjp(camera, &p, &gaussian.scale, &sums.footprint, v_compensation);
-                if !means.is_empty() {
-                    add(means, 3 * i, &[v.mean.x, v.mean.y, v.mean.z]);
-                }
-                if !rotations.is_empty() {
-                    add(rotations, 4 * i, &[v.rotation.w, v.rotation.x, v.rotation.y, v.rotation.z]);
-                }
-                if !scales.is_empty() {
-                    add(scales, 3 * i, &[v.scale.x, v.scale.y, v.scale.z]);
-                }
+                add(out.means, i, [v.mean.x, v.mean.y, v.mean.z]);
+                add(out.rotations, i, [v.rotation.w, v.rotation.x, v.rotation.y, v.rotation.z]);
+                add(out.scales, i, [v.scale.x, v.scale.y, v.scale.z]);
             }
         }
     });
 }
 
-fn add(out: &mut [f32], at: usize, values: &[f32]) {
-    out[at..at + values.len()].iter_mut().zip(values).for_each(|(o, v)| *o += v);
+/// Adds `values` to row `row`, if the gradient is wanted.
+fn add<const N: usize>(out: &mut [f32], row: usize, values: [f32; N]) {
+    if !out.is_empty() {
+        out[N * row..N * (row + 1)].iter_mut().zip(values).for_each(|(o, v)| *o += v);
+    }
 }

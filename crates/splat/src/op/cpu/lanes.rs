@@ -9,15 +9,7 @@ use super::splats::Visible;
 pub type Lanes = [f32; TILE];
 
 /// Pixel centres of a tile's columns, relative to the tile's first pixel.
-pub const CENTRES: Lanes = {
-    let mut centres = [0.0; TILE];
-    let mut i = 0;
-    while i < TILE {
-        centres[i] = i as f32 + 0.5;
-        i += 1;
-    }
-    centres
-};
+const CENTRES: Lanes = [0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 10.5, 11.5, 12.5, 13.5, 14.5, 15.5];
 
 /// A splat along a row of pixels.
 pub struct Row {

@@ -248,7 +248,7 @@ fn lists(
         scene.uniforms(job),
         job.options.antialiased,
     );
-    let (_, order) = sort::sort_pairs(buffers, keys, None, total, u32::BITS);
+    let (_, order) = sort::sort(buffers, keys, total, u32::BITS);
     let sorted = buffers.u32(total);
     project::sort_counts::launch(
         &buffers.client,
@@ -289,7 +289,7 @@ fn lists(
         scene.uniforms(job),
     );
     let bits = usize::BITS - all_tiles.leading_zeros();
-    let (sorted_tiles, slots) = sort::sort_pairs(buffers, tile_of, None, len, bits);
+    let (sorted_tiles, slots) = sort::sort(buffers, tile_of, len, bits);
     project::lists::launch(
         &buffers.client,
         one_each(len),

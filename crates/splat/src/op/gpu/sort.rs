@@ -1,4 +1,4 @@
-//! Stable radix sort of u32 keys with u32 values, four bits a pass.
+//! Stable radix sort of u32 keys with their positions, four bits a pass.
 
 use cubecl::prelude::*;
 
@@ -17,21 +17,13 @@ const COUNTERS: usize = DIGITS * UNITS;
 /// Consecutive counters that one unit adds up.
 const SHARE: usize = COUNTERS / UNITS;
 
-/// Sorts `n` pairs by the lowest `bits` bits of their keys; equal keys keep their order. Without `values`, the values
-/// are 0, 1, 2 … Returns keys and values.
-pub fn sort_pairs(
-    buffers: &Buffers,
-    keys: CubeTensor,
-    values: Option<CubeTensor>,
-    n: usize,
-    bits: u32,
-) -> (CubeTensor, CubeTensor) {
+/// Sorts `n` keys by their lowest `bits` bits; equal keys keep their order. Returns the keys and their old positions.
+pub fn sort(buffers: &Buffers, keys: CubeTensor, n: usize, bits: u32) -> (CubeTensor, CubeTensor) {
     let blocks = n.div_ceil(BLOCK).max(1);
     let dim = CubeDim::new_1d(UNITS as u32);
-    let mut counting = values.is_none();
-    let mut pairs = (keys.clone(), values.unwrap_or(keys));
+    let mut pairs = (keys.clone(), keys);
     let mut shift = 0;
-    // At least one pass, since the first pass makes the values 0, 1, 2 ….
+    // At least one pass, since the first pass makes the positions.
     while shift == 0 || shift < bits {
         let counts = buffers.u32(DIGITS * blocks);
         let mask = (1 << (bits - shift).min(BITS)) - 1;
@@ -61,10 +53,9 @@ pub fn sort_pairs(
             blocks,
             shift,
             mask,
-            counting,
+            shift == 0,
         );
         pairs = sorted;
-        counting = false;
         shift += BITS;
     }
     pairs
@@ -175,7 +166,7 @@ fn scatter(
 #[cfg(test)]
 mod tests {
     use super::super::buffers::testing::{read, upload, with_buffers};
-    use super::sort_pairs;
+    use super::sort;
 
     fn check(keys: &[u32], bits: u32) {
         with_buffers(|buffers| {
@@ -185,15 +176,9 @@ mod tests {
             order.sort_by_key(|&i| keys[i as usize] & mask);
             let sorted: Vec<u32> = order.iter().map(|&i| keys[i as usize]).collect();
 
-            let (got_keys, got_order) = sort_pairs(buffers, upload(buffers, keys), None, n, bits);
+            let (got_keys, got_order) = sort(buffers, upload(buffers, keys), n, bits);
             assert!(read(got_keys)[..n] == sorted, "{n} keys of {bits} bits");
             assert!(read(got_order)[..n] == order, "{n} positions, {bits} bits");
-
-            let values: Vec<u32> = (0..n as u32).map(|i| i.wrapping_mul(77) ^ 5).collect();
-            let given = Some(upload(buffers, &values));
-            let (_, got) = sort_pairs(buffers, upload(buffers, keys), given, n, bits);
-            let expected: Vec<u32> = order.iter().map(|&i| values[i as usize]).collect();
-            assert!(read(got)[..n] == expected, "{n} values, {bits} bits");
         });
     }
 

@@ -1,0 +1,18 @@
+//! Plain loops compiled for the widest vectors of the processor.
+
+use pulp::{Arch, Simd, WithSimd};
+
+/// Runs `loops`, a closure with `#[inline(always)]`, in a function with all vector instructions of this processor.
+/// pulp inlines the trait's method into that function. It would call a closure through `FnOnce`'s shim, which the
+/// compiler may keep apart, for the baseline's instructions.
+pub fn vectorized<R>(loops: impl FnMut() -> R) -> R {
+    struct Loops<F>(F);
+    impl<R, F: FnMut() -> R> WithSimd for Loops<F> {
+        type Output = R;
+        #[inline(always)]
+        fn with_simd<S: Simd>(mut self, _: S) -> R {
+            (self.0)()
+        }
+    }
+    Arch::new().dispatch(Loops(loops))
+}
