@@ -184,6 +184,9 @@ fn less(words: &[String]) -> Words {
             for key in keys {
                 more.extend(["--set", key]);
             }
+            if !words.iter().any(|word| word == "--weights") {
+                more.extend(["--set", "model.set=[\"network.resolution=256\"]"]);
+            }
         }
         // Servers do not end; tests/tests/view.rs and studio.rs test them.
         "view" | "studio" => more.push("--help"),
