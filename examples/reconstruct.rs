@@ -5,7 +5,7 @@
 //! cargo run --release --example reconstruct -- FRONT.png BACK.png OUT.ply
 //! ```
 //!
-//! The photographs need transparent backgrounds. The result has the same bytes as that of `snapsnap reconstruct`.
+//! The photographs need transparent backgrounds. The result has the same bytes as the result of `snapsnap reconstruct`.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};

@@ -67,7 +67,7 @@ fn recorded(page: &str, script: &str, arguments: &[String]) -> Vec<Words> {
     text.split_terminator('\u{1e}').map(words).collect()
 }
 
-/// Commands of a page: those of its blocks, and those of scripts that they run.
+/// Commands of a page: of its blocks, and of scripts that they run.
 fn commands(page: &str) -> Vec<Words> {
     let mut all = Vec::new();
     for block in blocks(page) {

@@ -305,7 +305,7 @@ fn sog_picture(archive: &mut zip::ZipArchive<fs::File>, name: &str) -> Vec<[u8; 
     picture.pixels().map(|pixel| pixel.0).collect()
 }
 
-/// The values of a SOG, decoded as its specification says, are those of the cloud within the steps of bytes.
+/// The values of a SOG, decoded as its specification says, equal the values of the cloud within the steps of bytes.
 #[test]
 fn a_sog_has_the_clouds_values_in_its_steps() {
     let temporary = tempfile::tempdir().expect("temporary folder");

@@ -19,7 +19,7 @@ const LAYERS: [(&str, &[&str]); 11] = [
     ("app", &["train", "eval", "data", "photo", "people", "net", "ops", "mesh", "splat", "base"]),
 ];
 
-/// Dependencies within the workspace, those of tests included, by the manifest of each folder below `crates`.
+/// Dependencies within the workspace, of tests too, by the manifest of each folder below `crates`.
 fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
     let crates = Path::new(env!("CARGO_MANIFEST_DIR")).join("../crates");
     let folders = fs::read_dir(crates).expect("the crates").map(|entry| entry.expect("an entry").path());

@@ -54,7 +54,7 @@ pub struct Variant {
 }
 
 impl Variant {
-    /// This variant with the unset keys of `base`. Overrides of the config follow those of `base`.
+    /// This variant with the unset keys of `base`. Overrides of the config follow the overrides of `base`.
     pub fn over(self, base: &Self) -> Self {
         let mut keys = base.keys();
         keys.extend(self.keys());

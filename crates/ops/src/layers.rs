@@ -60,7 +60,7 @@ pub fn layer_norm(layer: &nn::LayerNorm, epsilon: f64, x: Tensor<3>) -> Tensor<3
         let affine = [weight, bias.val()].map(|parameter| parameter.unsqueeze::<3>().expand(shape));
         return in_f32(x, |x| normalised(x, epsilon, affine));
     }
-    // Without gradients, the results are those of Burn's operator.
+    // Without gradients, the results equal the results of Burn's operator.
     let is_tracked = x.device().is_autodiff() && has_kernels(&x);
     let Some(bias) = layer.beta.as_ref().filter(|_| is_tracked) else {
         return in_f32(x, |x| layer.forward(x));

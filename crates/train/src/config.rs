@@ -1,4 +1,4 @@
-//! The TOML schema of a training: the networks' sections and those of data, steps, optimiser and losses.
+//! The TOML schema of a training: the networks' sections and the sections of data, steps, optimiser and losses.
 
 use std::path::PathBuf;
 

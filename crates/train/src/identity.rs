@@ -100,7 +100,7 @@ impl Identity {
         [harmful, harmless]
     }
 
-    /// Whether scores of validations do not compare with those of the identity `there`.
+    /// Whether scores of validations do not compare with the scores of the identity `there`.
     pub fn validates_otherwise(&self, there: &Self) -> bool {
         let is_other = differences(&there.config, &self.config).iter().any(|(key, _)| {
             VALIDATION.iter().any(|start| key.starts_with(start)) && !key.starts_with(TRAINING_ALONE)

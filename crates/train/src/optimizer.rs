@@ -320,7 +320,7 @@ mod tests {
         }
     }
 
-    /// Networks of another device keep it, and Muon's steps are those of the host.
+    /// Networks of another device keep it, and Muon's steps equal the steps on the host.
     #[test]
     fn steps_on_another_device_are_the_hosts() {
         #[allow(deprecated, reason = "the second CPU implementation")]

@@ -14,7 +14,7 @@ const LAUNCHERS: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMIX_RANK", "PMI_RANK"];
 /// Environment variables with the number of processes. `srun` sets the last one.
 const SIZES: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS"];
 
-/// The place of this process among those of its training.
+/// The place of this process among the processes of its training.
 pub struct Ranks {
     /// This process among all: 0 is the first.
     pub rank: usize,

@@ -41,7 +41,7 @@ pub struct Case {
 
 #[derive(Debug, Clone)]
 enum Damage {
-    /// The file's bytes, or those of a part inside of it.
+    /// The file's bytes, or the bytes of a part inside of it.
     Changes(Vec<Change>, Option<Index>),
     /// The file ends early, after this share of its length.
     Short(f64),

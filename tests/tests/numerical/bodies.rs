@@ -101,7 +101,7 @@ fn a_mirrored_back_is_the_back_of_a_mirrored_photograph() {
         let flipped = |x: &Tensor<4>| Tensor::cat(vec![half(x, 0), half(x, 1).flip([3])], 0);
         let seen = Input::new(&mirrored, colors.clone(), masks.clone(), &window);
         let mut other = Input::new(&plain, flipped(&colors), flipped(&masks), &window);
-        // Rays are those of the back's own camera, so the mirrored photograph needs the opposite x.
+        // Rays belong to the back's own camera, so the mirrored photograph needs the opposite x.
         let rays = other.images.clone().narrow(1, 4, 1);
         let rays = Tensor::cat(vec![half(&rays, 0), -half(&rays, 1)], 0);
         let [_, _, h, w] = other.images.dims();

@@ -49,7 +49,7 @@ fn said(output: &Output) -> String {
     String::from_utf8_lossy(&[&output.stdout[..], &output.stderr].concat()).into_owned()
 }
 
-/// Messages of the program among those of `mpirun`.
+/// Messages of the program among the messages of `mpirun`.
 fn errors(output: &Output) -> Vec<String> {
     said(output).lines().filter(|line| line.starts_with("error: ")).map(str::to_owned).collect()
 }

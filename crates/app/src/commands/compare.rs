@@ -30,7 +30,7 @@ pub struct Arguments {
     /// Mask of the person (any value above 0), or a folder of such pictures.
     #[arg(long, value_name = "MASK")]
     mask: Option<PathBuf>,
-    /// Compared pixels: all; those of the paper's window of 1000 × 500 of 1024 pixels around the pixels of B that are
+    /// Compared pixels: all; pixels of the paper's window of 1000 × 500 of 1024 pixels around the pixels of B that are
     /// not black; or the mask and 8 of 1024 pixels around it. Default: the mask if one is given, else all.
     #[arg(long, value_enum)]
     window: Option<Window>,

@@ -17,7 +17,7 @@ use crate::progress::Progress;
 use crate::report::{ReportFolder, header};
 use crate::{device, say, weights};
 
-/// AdamW steps of a full run (docs/method.md, "Stability cases"), and those of a quick run.
+/// AdamW steps of a full run (docs/method.md, "Stability cases"), and of a quick run.
 const MANY: u64 = 1_000_000;
 const FEW: u64 = 10_000;
 

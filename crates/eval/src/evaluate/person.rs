@@ -221,7 +221,7 @@ pub fn off(camera: &Camera, front: &Camera, wanted: f64) -> f64 {
     apart.min(360.0 - apart)
 }
 
-/// Azimuth of a camera around the world's y, degrees from that of `front`, 0 to 360.
+/// Azimuth of a camera around the world's y, degrees from the azimuth of `front`, 0 to 360.
 pub fn degrees(camera: &Camera, front: &Camera) -> f64 {
     let azimuth = |camera: &Camera| {
         let centre = camera.centre();

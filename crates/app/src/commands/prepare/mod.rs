@@ -76,7 +76,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
 
 #[derive(Args)]
 struct CheckArguments {
-    /// Folder of the data set, in this program's layout or in that of the authors' tools.
+    /// Folder of the data set, in this program's layout or in the layout of the authors' tools.
     dataset: PathBuf,
 }
 
@@ -214,7 +214,7 @@ fn make(
     let is_begun =
         folder.splits().into_iter().any(|split| folder.subjects(split).is_ok_and(|all| !all.is_empty()));
     let (path, resolved) = (common.output.join(CONFIG), config.to_toml());
-    // The cameras of people that are there already are those of this config; `dataset.toml` does not have all of them.
+    // People that are there already have the cameras of this config; `dataset.toml` does not have all of them.
     if let (true, Ok(there)) = (is_begun, DataConfig::from_file(&path, &[])) {
         let differing = differences(&keys(&there), &keys(&config));
         if !differing.is_empty() {

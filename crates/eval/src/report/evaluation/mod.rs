@@ -52,7 +52,7 @@ impl Evaluation<'_> {
         })
     }
 
-    /// Figures of `one` minus those of `other`, person by person, over the views that both have.
+    /// Figures of `one` minus figures of `other`, person by person, over the views that both have.
     fn difference(one: &Judged, other: &Judged, protocol: usize) -> [Option<Interval>; 3] {
         let place = |row: &Row| (row.person, row.turn, row.view);
         let both: BTreeSet<_> = one.rows.iter().map(place).collect();
