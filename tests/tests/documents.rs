@@ -190,6 +190,8 @@ fn less(words: &[String]) -> Words {
         }
         // Servers do not end; tests/tests/view.rs and studio.rs test them.
         "view" | "studio" => more.push("--help"),
+        // A mesh takes twelve seconds: one is made. tests/tests/surface.rs and batches.rs make textures and folders.
+        "mesh" if words.len() > 4 => more.push("--help"),
         "bench" => {
             more.push("--quick");
             if words.iter().any(|word| word == "configs/bench.toml") {
