@@ -1,7 +1,7 @@
 //! Commands with many inputs: existing outputs are skipped, failures are listed in a file, and other inputs go on.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::Read;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use clap::Args;
 use snapsnap_base::file;
+use snapsnap_base::folder::entries;
 use snapsnap_data::Shard;
 use snapsnap_splat::scene::Kind;
 
@@ -238,10 +239,5 @@ pub fn pictures(folder: &Path) -> Result<impl Iterator<Item = PathBuf>, Failure>
 
 /// The files in a folder that are not hidden.
 fn files(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
-    let cannot = |e: std::io::Error| Failure::file(folder, format_args!("cannot read: {e}"));
-    let entries = fs::read_dir(folder).map_err(cannot)?.map(|entry| entry.map(|entry| entry.path()));
-    let entries = entries.collect::<Result<Vec<_>, _>>().map_err(cannot)?;
-    let is_hidden =
-        |path: &Path| path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-    Ok(entries.into_iter().filter(|path| path.is_file() && !is_hidden(path)).collect())
+    Ok(entries(folder)?.into_iter().filter(|path| path.is_file()).collect())
 }

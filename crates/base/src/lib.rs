@@ -5,6 +5,7 @@ pub mod bilinear;
 pub mod config;
 mod error;
 pub mod file;
+pub mod folder;
 pub mod plot;
 pub mod random;
 

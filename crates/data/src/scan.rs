@@ -10,9 +10,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::dataset::Split;
 use snapsnap_base::FileError;
+use snapsnap_base::folder::entries;
 use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::{Mesh, MeshError};
-use snapsnap_people::files::entries;
 
 /// Height of a normalised subject in metres (docs/method.md, "Scans"). The real height is dropped on purpose: two
 /// photographs do not show it.

@@ -200,7 +200,7 @@ fn normalised(x: Tensor<4>) -> Tensor<4> {
 
 /// Features `[B,C,H,W]`, scaled to length 1 at every pixel.
 fn unit(x: Tensor<4>) -> Tensor<4> {
-    /// Least square, since the square root has no gradient at 0.
+    /// Least square, so that no length is 0.
     const MIN_SQUARE: f64 = 1e-30;
     let length = x.clone().square().sum_dim(1).clamp_min(MIN_SQUARE).sqrt();
     x / (length + EPSILON)

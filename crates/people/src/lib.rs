@@ -3,7 +3,6 @@
 
 pub mod avatars;
 mod figure;
-pub mod files;
 mod joint_names;
 pub mod makehuman;
 mod math;

@@ -7,10 +7,10 @@ use rand::Rng;
 use snapsnap_base::{FileError, file, quoted};
 
 use crate::figure::{Pose, sign};
-use crate::files::with_ending;
 use crate::joint_names::{Name, known, need};
 use crate::math::{rotate_x, rotate_y, rotate_z};
 use crate::skeleton::hanging;
+use snapsnap_base::folder::with_ending;
 
 /// Largest file, in bytes.
 const MAX_BYTES: u64 = 64 << 20;

@@ -16,8 +16,8 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
+use snapsnap_base::folder::entries;
 use snapsnap_base::{FileError, file, quoted};
-use snapsnap_people::files::entries;
 
 use super::{MAX_FILE, Split};
 

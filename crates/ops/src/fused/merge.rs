@@ -95,7 +95,7 @@ impl Merge<'_> {
     }
 }
 
-/// out = slope·out + curve·x + shift + branch. A closure would not be compiled for wide vectors.
+/// out = slope·out + curve·x + shift + branch, in fused multiply-adds.
 struct Descend<'a> {
     map: &'a Linear,
     plane: &'a [f32],

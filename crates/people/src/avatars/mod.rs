@@ -16,12 +16,12 @@ use snapsnap_mesh::import::{self, Rigged};
 use snapsnap_mesh::mesh::Mesh;
 
 use crate::figure::{Build, Figure, Pose};
-use crate::files::with_ending;
 use crate::math::rotate_y;
 use crate::poses::Poses;
 use crate::skeleton::{self, Owner};
 use crate::synth::stand;
 use joints::{Region, Skeleton};
+use snapsnap_base::folder::with_ending;
 
 /// Accepted heights of characters in metres. Other heights mean another unit.
 const HEIGHTS: std::ops::RangeInclusive<f32> = 0.5..=3.0;

@@ -10,8 +10,8 @@ use serde::de::DeserializeOwned;
 use snapsnap_base::{FileError, file, quoted};
 
 use super::proxy::{Proxy, wardrobe};
-use crate::files::with_ending;
 use crate::poses::Poses;
+use snapsnap_base::folder::with_ending;
 
 /// Metres per unit of MakeHuman's files, a decimetre.
 pub const METRES: f32 = 0.1;

@@ -11,9 +11,9 @@ use snapsnap_mesh::mesh::pieces;
 
 use super::files::{METRES, read_text, vector, wrong};
 use super::patch::{Patch, Vertex};
-use crate::files::{entries, with_ending};
 use crate::pattern::Pattern;
 use crate::synth::outfit::{Cut, Outfit};
+use snapsnap_base::folder::{entries, with_ending};
 
 /// Share of people in a suit of the collection, among people without a skirt or a coat.
 const SUITS: f32 = 0.7;

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use snapsnap_base::FileError;
+use crate::FileError;
 
 /// Entries of a folder in order of name, without hidden files, which some systems add to copied folders.
 ///
