@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
 use image::{Rgb, RgbImage, RgbaImage};
+use snapsnap_net::blazepose::{BlazePose, Pose};
 use snapsnap_net::u2net::U2Net;
 use snapsnap_net::weights::Source;
 use snapsnap_tests::sample::{over, paths, picture, reconstruct};
@@ -38,34 +39,69 @@ fn share(of: impl Iterator<Item = bool>) -> f64 {
     f64::from(set) / f64::from(all)
 }
 
-/// `docs/u2netp_convert.py` wrote the reference: ONNX Runtime's output for the same picture, at every eighth pixel.
-#[test]
-fn the_network_is_that_of_onnx_runtime() {
+/// Every n-th pixel of the sample's front over a coloured ramp, `[3, SIDE, SIDE]`, as the converters make it.
+fn over_a_ramp(side: u32) -> Vec<f32> {
     let front = picture("front");
-    let at = |row: u32| row * front.width() / 320;
+    let at = |row: u32| row * front.width() / side;
     let value = |channel: usize| {
         let front = &front;
-        (0..320 * 320).map(move |i| {
-            let (x, y) = (i % 320, i / 320);
+        (0..side * side).map(move |i| {
+            let (x, y) = (i % side, i / side);
             let pixel = front.get_pixel(at(x), at(y)).0.map(|v| f64::from(v) / 255.0);
-            let behind = [f64::from(x) / 320.0, f64::from(y) / 320.0, 0.4][channel];
+            let behind = [f64::from(x) / f64::from(side), f64::from(y) / f64::from(side), 0.4][channel];
             (pixel[3] * pixel[channel] + (1.0 - pixel[3]) * behind) as f32
         })
     };
-    let rgb: Vec<f32> = (0..3).flat_map(value).collect();
-    let device = Device::flex();
-    let source = Source::open(&root().join("assets/weights/u2netp.safetensors")).expect("weights");
-    let found = U2Net::load(&source, &device).expect("weights").forward(&rgb, &device);
-    let expected = std::fs::read(data("u2netp.f32")).expect("reference");
-    let expected = expected.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
-    let apart = expected.enumerate().map(|(i, expected)| {
-        let (x, y) = (i % 40, i / 40);
-        (found[(8 * y + 4) * 320 + 8 * x + 4] - expected).abs()
+    (0..3).flat_map(value).collect()
+}
+
+fn reference(name: &str) -> Vec<f32> {
+    let bytes = std::fs::read(data(name)).expect("reference");
+    bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect()
+}
+
+fn weights(name: &str) -> Source {
+    Source::open(&root().join("assets/weights").join(name)).expect("weights")
+}
+
+/// The largest difference of every eighth pixel of a mask from the reference.
+fn apart(found: &[f32], side: usize, expected: &[f32]) -> f32 {
+    let columns = side / 8;
+    assert_eq!(expected.len(), columns * columns);
+    let apart = expected.iter().enumerate().map(|(i, expected)| {
+        (found[(8 * (i / columns) + 4) * side + 8 * (i % columns) + 4] - expected).abs()
     });
-    let (largest, count) =
-        apart.fold((0.0_f32, 0), |(largest, count), apart| (largest.max(apart), count + 1));
+    apart.fold(0.0, f32::max)
+}
+
+/// `docs/u2netp_convert.py` wrote the reference: ONNX Runtime's output for the same picture, at every eighth pixel.
+#[test]
+fn the_network_is_that_of_onnx_runtime() {
+    let device = Device::flex();
+    let network = U2Net::load(&weights("u2netp.safetensors"), &device).expect("weights");
+    let largest = apart(&network.forward(&over_a_ramp(320), &device), 320, &reference("u2netp.f32"));
     println!("largest difference {largest:e}");
-    assert!(count == 1600 && largest < 1e-3, "{largest}");
+    assert!(largest < 1e-3, "{largest}");
+}
+
+/// `docs/blazepose_convert.py` wrote the reference: LiteRT's landmarks, presence, and logits of every eighth pixel.
+#[test]
+fn the_pose_network_is_that_of_litert() {
+    let device = Device::flex();
+    let network = BlazePose::load(&weights("blazepose.safetensors"), &device).expect("weights");
+    let since = std::time::Instant::now();
+    let Pose { landmarks, presence, mask } = network.forward(&over_a_ramp(256), &device);
+    println!("{:.0} ms", 1e3 * since.elapsed().as_secs_f64());
+    let expected = reference("blazepose.f32");
+    let (expected_landmarks, rest) = expected.split_at(195);
+    let found = landmarks.as_flattened();
+    assert_eq!(found.len(), 195);
+    // In pixels of the picture and in logits.
+    let largest = found.iter().zip(expected_landmarks).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    let logits: Vec<f32> = rest[1..].iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect();
+    let masks = apart(&mask, 256, &logits);
+    println!("largest differences: landmarks {largest:e}, mask {masks:e}");
+    assert!(largest < 1e-3 && masks < 1e-3 && (presence - rest[0]).abs() < 1e-3, "{largest} {masks}");
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 mod heic;
 mod jpeg;
+mod profile;
 #[cfg(test)]
 mod tests;
 
@@ -18,7 +19,7 @@ pub const MAX_BYTES: u64 = 768 << 20;
 /// Largest picture file that is read into memory before it is decoded.
 const MAX_FILE: u64 = 1 << 30;
 
-/// The picture in `path`, turned upright according to its EXIF data.
+/// The picture in `path` in sRGB, turned upright according to its EXIF data.
 ///
 /// # Errors
 /// [`FileError`] for a file that cannot be read, is no picture, is damaged or cut short, or would take more than
@@ -96,10 +97,14 @@ fn decode_from(path: &Path, mut source: impl BufRead + Seek, most: u64) -> Resul
         let bytes = whole(path, source)?;
         let (size, needed) = heic::size(&bytes).map_err(&failed)?;
         check(size, needed)?;
-        return heic::decode(&bytes).map_err(&failed);
+        let picture = heic::decode(&bytes).map_err(&failed)?;
+        return Ok(match heic::profile(&bytes) {
+            Some(profile) => profile::from_profile(picture, &profile),
+            None => picture,
+        });
     }
     let reader = ImageReader::new(source).with_guessed_format().map_err(FileError::read(path))?;
-    let (mut picture, orientation) = if reader.format() == Some(ImageFormat::Jpeg) {
+    let (picture, orientation, icc) = if reader.format() == Some(ImageFormat::Jpeg) {
         let bytes = whole(path, reader.into_inner())?;
         let jpeg = jpeg::Jpeg::open(&bytes).map_err(&failed)?;
         check(jpeg.size, 0)?;
@@ -108,8 +113,11 @@ fn decode_from(path: &Path, mut source: impl BufRead + Seek, most: u64) -> Resul
         let mut decoder = reader.into_decoder().map_err(&failed)?;
         check(decoder.dimensions().into(), decoder.total_bytes())?;
         let orientation = decoder.orientation().map_err(&failed)?;
-        (DynamicImage::from_decoder(decoder).map_err(&failed)?, orientation)
+        // A damaged profile is no reason to refuse a picture.
+        let icc = decoder.icc_profile().ok().flatten();
+        (DynamicImage::from_decoder(decoder).map_err(&failed)?, orientation, icc)
     };
+    let mut picture = profile::to_srgb(picture, icc.as_deref());
     picture.apply_orientation(orientation);
     Ok(picture)
 }

@@ -147,7 +147,8 @@ fn rectified(layer: &Conv2d, x: Tensor<4>) -> Tensor<4> {
     relu(layers::conv2d(layer, x, false))
 }
 
-fn convolution(
+/// Reads a convolution with as many rows and columns out as in (of odd kernels). A kernel with one input is a depthwise one.
+pub(crate) fn convolution(
     source: &Source,
     name: &str,
     dilation: usize,
@@ -157,8 +158,10 @@ fn convolution(
     let values = [source.read_f32(&weight)?, source.read_f32(&bias)?];
     let shape: [usize; 4] = source.tensors()[&weight].shape.clone().try_into().expect("four axes");
     let [outputs, inputs, rows, columns] = shape;
-    let padding = dilation * (rows / 2);
-    let mut layer = Conv2dConfig::new([inputs, outputs], [rows, columns])
+    let padding = dilation * ((rows - 1) / 2);
+    let groups = if inputs == 1 { outputs } else { 1 };
+    let mut layer = Conv2dConfig::new([groups * inputs, outputs], [rows, columns])
+        .with_groups(groups)
         .with_dilation([dilation; 2])
         .with_padding(PaddingConfig2d::Explicit(padding, padding, padding, padding))
         .init(device);

@@ -10,12 +10,13 @@ use snapsnap_mesh::picture::{self, MAX_BYTES};
 use snapsnap_net::Photograph;
 
 use crate::exif_camera::{Frame, Shot};
-use crate::matting::matte;
+use crate::joints::{Joints, Look};
+use crate::matting::{Matte, matte};
 use crate::placing::{Mapping, Standing, on_canvas, placed, placed_as_demo};
 use crate::recentring::Turn;
 use crate::rect::Rect;
 use crate::report::{Canvas, PhotoReport};
-use crate::segmenter::segment;
+use crate::segmenter::{pose, segment};
 use crate::source::{Content, Cutting, Placement, Source};
 use crate::{INSIDE, mask_rim, mask_strokes, specks};
 
@@ -31,6 +32,11 @@ pub(super) struct Cutout<'a> {
     pub mask: GrayImage,
     pub frame: Frame,
     pub report: PhotoReport,
+    /// The person's joints in the photograph before it is turned; `None` if the pose network sees nobody, or was not
+    /// asked.
+    pub joints: Option<Joints>,
+    /// Whether the pose network was asked.
+    pub is_asked: bool,
 }
 
 impl<'a> Cutout<'a> {
@@ -71,13 +77,15 @@ impl<'a> Cutout<'a> {
         }
         let is_given = given.is_ok();
         let rgb = picture.into_rgb8();
-        let (mut rgb, mut mask) = match (given, cutting) {
-            (Ok(mask), _) => (rgb, mask),
-            (Err(_), Cutting::Missing | Cutting::All) => matte(rgb, &segment, strokes).ok_or_else(|| {
-                let message =
-                    "no person was found in the picture: give masks with --masks FRONT_MASK BACK_MASK";
-                FileError::unsuitable(path, message)
-            })?,
+        let Matte { mut rgb, mut mask, mut look } = match (given, cutting) {
+            (Ok(mask), _) => Matte { rgb, mask, look: None },
+            (Err(_), Cutting::Missing | Cutting::All) => {
+                matte(rgb, &segment, &pose, strokes).ok_or_else(|| {
+                    let message =
+                        "no person was found in the picture: give masks with --masks FRONT_MASK BACK_MASK";
+                    FileError::unsuitable(path, message)
+                })?
+            }
             (Err(message), Cutting::Given) => return Err(FileError::unsuitable(path, message)),
         };
         // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
@@ -98,6 +106,11 @@ impl<'a> Cutout<'a> {
             let message = "the person is of a single colour: this is no photograph";
             return Err(FileError::unsuitable(path, message));
         }
+        // Training samples need no joints.
+        let is_asked = is_file || !is_given;
+        if is_given && is_file {
+            look = Look::at(&rgb, person, &pose);
+        }
         let report = PhotoReport {
             size: [width, height],
             cut_out: (!is_given).then(|| rgb.dimensions().into()),
@@ -110,7 +123,8 @@ impl<'a> Cutout<'a> {
         };
         let shot = if is_file { Shot::of(&source) } else { Shot::default() };
         let frame = Frame { shot, size: rgb.dimensions().into(), mapping: Mapping::AS_IT_IS };
-        Ok(Self { path, mask_path, rgb, mask, frame, report })
+        let joints = look.map(|look| look.joints);
+        Ok(Self { path, mask_path, rgb, mask, frame, report, joints, is_asked })
     }
 
     /// Turns the photograph towards the middle of the person's box, or of the common box of both photographs. Returns

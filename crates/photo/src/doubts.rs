@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::INSIDE;
 use super::cutout::Cutout;
+use crate::joints::{Facing, Joints, Part};
 use crate::rect::Rect;
 
 /// Share of a border from which the mask counts as touching the border.
@@ -18,12 +19,6 @@ const WIDEST: f32 = 1.2;
 /// Least overlap (intersection over union) of the front's silhouette and the mirrored back's, scaled to one height.
 /// Right pairs have 0.63 and more (docs/notes/photographs.md).
 const OVERLAP: f32 = 0.6;
-/// Rows of the face below the top of the person's box, as shares of the height.
-const FACE: [f32; 2] = [0.03, 0.11];
-/// Columns of the face on either side of the head's middle, as a share of the height.
-const HALF_FACE: f32 = 0.03;
-/// Difference of the shares of skin-coloured pixels from which the pictures may be swapped.
-const SWAPPED: f32 = 0.5;
 /// Side of the grid on which silhouettes and colours are compared, in cells.
 const GRID: u32 = 64;
 /// Columns of a silhouette's grid, which is wider than outstretched arms.
@@ -42,7 +37,7 @@ pub struct Doubt {
 }
 
 /// What is wrong with photographs.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "sign", rename_all = "kebab-case")]
 pub enum Sign {
     /// The mask touches more borders of the picture than a person does.
@@ -59,8 +54,31 @@ pub enum Sign {
     Equal,
     /// One is the mirror image of the other.
     Mirrored,
-    /// Only the second shows a face.
+    /// The first shows the back, the second the front. They were exchanged.
     Swapped,
+    /// Both show the same side.
+    SameSide {
+        /// The side.
+        facing: Facing,
+    },
+    /// The photograph shows the person from the side.
+    FromTheSide,
+    /// Nobody is recognised.
+    Nobody,
+    /// The person lies.
+    Lies,
+    /// The person sits.
+    Sits,
+    /// Parts of the body are outside of the picture.
+    Outside {
+        /// The parts.
+        parts: Vec<Part>,
+    },
+    /// Limbs are elsewhere in the mirrored back.
+    Moved {
+        /// The limbs.
+        parts: Vec<Part>,
+    },
     /// The silhouettes do not fit one another.
     LittleOverlap {
         /// Intersection over union.
@@ -71,7 +89,7 @@ pub enum Sign {
 impl fmt::Display for Doubt {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}: ", self.photographs.join(" and "))?;
-        match self.sign {
+        match &self.sign {
             Sign::TouchesBorders { borders } => write!(
                 f,
                 "the mask touches {borders} borders of the picture: is it inverted? The person must be white"
@@ -82,12 +100,25 @@ impl fmt::Display for Doubt {
             ),
             Sign::Equal => write!(f, "this is the same picture twice"),
             Sign::Mirrored => write!(f, "one is the mirror image of the other"),
-            Sign::Swapped => write!(
-                f,
-                "the head has the colour of skin in the second picture only: are front and back swapped?"
-            ),
+            Sign::Swapped => {
+                write!(f, "the first shows the back, the second the front: they were exchanged")
+            }
+            Sign::SameSide { facing } => {
+                let side = if *facing == Facing::Front { "front" } else { "back" };
+                write!(f, "both show the person's {side}: one must show the front, one the back")
+            }
+            Sign::FromTheSide => write!(f, "the person is seen from the side, not from the front or back"),
+            Sign::Nobody => write!(f, "nobody is recognised in the picture"),
+            Sign::Lies => write!(f, "the person does not stand upright"),
+            Sign::Sits => write!(f, "the person seems to sit: the person should stand"),
+            Sign::Outside { parts } => {
+                write!(f, "outside of the picture: {}: the whole person must be visible", list(parts))
+            }
+            Sign::Moved { parts } => {
+                write!(f, "elsewhere in the back photograph: {}: both need one pose", list(parts))
+            }
             Sign::LittleOverlap { overlap } => {
-                let share = (100.0 * overlap).round();
+                let share = (100.0 * *overlap).round();
                 write!(
                     f,
                     "the silhouettes of the front and of the mirrored back overlap by {share} % only: are they one person in one pose?"
@@ -97,8 +128,21 @@ impl fmt::Display for Doubt {
     }
 }
 
+fn list(parts: &[Part]) -> String {
+    parts.iter().map(Part::to_string).collect::<Vec<_>>().join(", ")
+}
+
+/// Whether the first photograph shows the back and the second one the front.
+pub(super) fn are_swapped(front: &Cutout, back: &Cutout) -> bool {
+    (facing(front), facing(back)) == (Some(Facing::Back), Some(Facing::Front))
+}
+
+fn facing(one: &Cutout) -> Option<Facing> {
+    one.joints.as_ref().and_then(Joints::facing)
+}
+
 /// The doubts about both photographs.
-pub(super) fn doubts(front: &Cutout, back: &Cutout) -> Vec<Doubt> {
+pub(super) fn doubts(front: &Cutout, back: &Cutout, swapped: bool) -> Vec<Doubt> {
     let mut doubts = Vec::new();
     let mut add = |about: &[&Cutout], sign: Sign| {
         let photographs = about.iter().map(|one| one.path.display().to_string()).collect();
@@ -113,6 +157,20 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout) -> Vec<Doubt> {
         if width as f32 > WIDEST * height as f32 {
             add(&[one], Sign::Wide { size: [width, height] });
         }
+        let Some(joints) = &one.joints else {
+            if one.is_asked {
+                add(&[one], Sign::Nobody);
+            }
+            continue;
+        };
+        let parts = joints.outside(one.frame.size);
+        let signs = [
+            (joints.lies(), Sign::Lies),
+            (!joints.lies() && joints.sits(), Sign::Sits),
+            (joints.facing() == Some(Facing::Side), Sign::FromTheSide),
+            (!parts.is_empty(), Sign::Outside { parts }),
+        ];
+        signs.into_iter().filter(|(is_so, _)| *is_so).for_each(|(_, sign)| add(&[one], sign));
     }
     let both = [front, back];
     if are_equal(front, back, false) {
@@ -120,8 +178,22 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout) -> Vec<Doubt> {
     } else if are_equal(front, back, true) {
         add(&both, Sign::Mirrored);
     } else {
-        if skin(front) + SWAPPED < skin(back) {
+        if swapped {
             add(&both, Sign::Swapped);
+        }
+        if let (Some(a), Some(b)) = (&front.joints, &back.joints) {
+            match (a.facing(), b.facing()) {
+                (Some(Facing::Front), Some(Facing::Back)) => {
+                    let parts = a.moved(b);
+                    if !parts.is_empty() {
+                        add(&both, Sign::Moved { parts });
+                    }
+                }
+                (Some(facing), other) if Some(facing) == other && facing != Facing::Side => {
+                    add(&both, Sign::SameSide { facing });
+                }
+                _ => {}
+            }
         }
         let overlap = overlap(front, back);
         if overlap < OVERLAP {
@@ -196,34 +268,6 @@ fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
         }
     }
     count > 0 && sum / count as f32 <= EQUAL
-}
-
-/// Share of the face's pixels that have the hue of skin, which hardly depends on brightness (Chai and Ngan, "Face
-/// segmentation using skin-color map in videophone applications", 1999). Brown hair has this hue as well.
-fn skin(one: &Cutout) -> f32 {
-    let Rect { x, y, width, height } = one.report.person;
-    let at = |share: f32| (share * height as f32) as u32;
-    let rows = y + at(FACE[0])..(y + at(FACE[1])).max(y + at(FACE[0]) + 1);
-    let inside = |x: u32, y: u32| one.mask.get_pixel(x, y)[0] >= INSIDE;
-    let columns: Vec<u32> =
-        rows.clone().flat_map(|y| (x..x + width).filter(move |x| inside(*x, y))).collect();
-    if columns.is_empty() {
-        return 0.0;
-    }
-    let middle = (columns.iter().map(|x| u64::from(*x)).sum::<u64>() / columns.len() as u64) as u32;
-    let half = at(HALF_FACE);
-    let (mut count, mut all) = (0_u32, 0_u32);
-    for y in rows {
-        for x in (middle.saturating_sub(half).max(x)..=(middle + half).min(x + width - 1))
-            .filter(|x| inside(*x, y))
-        {
-            let [r, g, b] = color(&one.rgb, (x, y));
-            let [blue, red] = [-0.1687 * r - 0.3313 * g + 0.5 * b, 0.5 * r - 0.4187 * g - 0.0813 * b];
-            all += 1;
-            count += u32::from((-51.0..=-1.0).contains(&blue) && (5.0..=45.0).contains(&red));
-        }
-    }
-    count as f32 / all.max(1) as f32
 }
 
 fn color(picture: &RgbImage, (x, y): (u32, u32)) -> [f32; 3] {

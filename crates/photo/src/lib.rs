@@ -4,6 +4,7 @@ mod cutout;
 mod doubts;
 mod exif_camera;
 mod exposure;
+mod joints;
 mod mask_rim;
 mod mask_strokes;
 mod matting;
@@ -30,6 +31,7 @@ use cutout::Cutout;
 pub use doubts::{Doubt, Sign};
 pub use exif_camera::{ELEVATIONS, FOCALS, Frame, Shot, Viewpoint};
 use exposure::match_back;
+pub use joints::{Facing, Part};
 pub use person::{
     DISTANCES, DistanceBy, ElevationBy, Lens, NoGaussian, Person, Seat, Told, Unplaced, person,
 };
@@ -60,7 +62,7 @@ pub struct Photographs {
 }
 
 /// Reads photographs and places each on a canvas of `side` pixels. `cutting` says where the mask of a source without
-/// one comes from. With [`Placement::Training`], two photographs whose sizes and boxes agree count as taken from one
+/// one comes from. A back photograph that stands before the front one is exchanged with it. With [`Placement::Training`], two photographs whose sizes and boxes agree count as taken from one
 /// place and get the same scale and offset. If a focal length is known, from the files or as `focal` (millimetres of
 /// 35 mm film), a photograph whose person is beside the middle is turned towards the person.
 ///
@@ -83,11 +85,16 @@ pub fn read(
         let own = &mut cutout.frame.shot;
         (own.focal, own.pitch) = (focal.or(own.focal).or(lens), own.pitch.or(pitch));
     }
+    let swapped = matches!(&*cutouts, [front, back] if doubts::are_swapped(front, back));
+    if swapped {
+        cutouts.reverse();
+    }
     let is_placed = matches!(placement, Placement::Training { .. });
     if let ([front, back], true) = (&mut *cutouts, is_placed) {
         back.report.gains = match_back((&front.rgb, &front.mask), (&mut back.rgb, &mut back.mask));
     }
-    let doubts = if let [front, back] = &*cutouts { doubts::doubts(front, back) } else { Vec::new() };
+    let doubts =
+        if let [front, back] = &*cutouts { doubts::doubts(front, back, swapped) } else { Vec::new() };
     let common = |cutouts: &[Cutout]| match cutouts {
         [front, back] if is_placed => {
             together([&front.mask, &back.mask], [front.report.person, back.report.person])

@@ -2,12 +2,13 @@
 //! edges with the photograph's (He et al., "Guided Image Filtering", 2013; He and Sun, "Fast Guided Filter", 2015),
 //! and mixed colours lose the background's share (Forte, "Approximate Fast Foreground Colour Estimation", 2021).
 
-use glam::{Mat3, Vec3};
+use glam::{Mat3, Vec2, Vec3};
 use image::imageops::{self, FilterType};
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use snapsnap_base::bilinear::{Tap, taps};
 use snapsnap_net::u2net::SIDE;
 
+use super::joints::{FindPose, Look};
 use super::specks::{Pieces, pieces};
 use super::unit_color;
 use crate::mask_strokes::paint;
@@ -20,6 +21,16 @@ const MARGIN: f32 = 0.1;
 const LIKELY: f32 = 0.5;
 /// Distance from the person's largest piece, in pixels of [`SIDE`], beyond which no pixel belongs to the person.
 const NEAR: usize = 6;
+/// Distance from the outline that the pose network sees, in pixels of that network, within which the other network
+/// decides the outline.
+const BAND: f32 = 6.0;
+/// Probability of the pose network from which a pixel behind the band is the person's. Gaps beside arms have less.
+const SURE: f32 = 0.99;
+/// Radius within which both networks are compared, in pixels of the pose network.
+const COMPARED: f32 = 8.0;
+/// Difference of the mean probabilities inside and outside of the pose network's outline from which the other network
+/// begins to count, and from which it decides alone.
+const TOLD_APART: (f32, f32) = (0.3, 0.7);
 /// Longest side of a cut-out. Larger pictures are reduced first, two of one size alike. Canvases have 1024 rows.
 const LONGEST: u32 = 4096;
 /// Longer side of the pictures on which filters are computed.
@@ -28,11 +39,6 @@ const FILTERED: u32 = 640;
 const RADIUS: usize = 4;
 /// Variance below which the photograph has no edges.
 const EPSILON: f32 = 1e-4;
-/// A gap in the person is filled if no probability in the gap is lower: the gap is a shadow, for example below the
-/// chin. Between an arm and the body probabilities are far lower.
-const NO_GAP: f32 = 0.2;
-/// Least coverage of a pixel that is no part of a gap.
-const WHOLE: f32 = 0.95;
 /// Up to the first coverage, a mask's pixel is background, from the second on, person: filtered edges are soft.
 const SOFT: (f32, f32) = (0.3, 0.7);
 /// These limits for colours: a mixed colour does more harm than a corrected one.
@@ -41,13 +47,25 @@ const MIXED: (f32, f32) = (0.1, 0.8);
 /// The signature of [`super::segmenter::segment`].
 type Segment<'a> = dyn Fn(&[f32]) -> Vec<f32> + 'a;
 
-/// Colours without the background's share, and coverage, of the person in a picture. A picture longer than [`LONGEST`]
-/// is reduced first. `strokes` correct the coverage. `None` if the network finds nobody.
+/// A cut-out.
+pub struct Matte {
+    /// Colours without the background's share.
+    pub rgb: RgbImage,
+    /// Coverage by the person.
+    pub mask: GrayImage,
+    /// What the pose network sees, if it sees a person.
+    pub look: Option<Look>,
+}
+
+/// Cuts the person out of a picture. A picture longer than [`LONGEST`] is reduced first. The pose network says where the
+/// person is, the network of salient objects where the outline runs. Without a person, the most salient object is cut
+/// out. `strokes` correct the coverage. `None` if neither network finds anything.
 pub fn matte(
     mut picture: RgbImage,
     segment: &Segment,
+    pose: &FindPose,
     strokes: Option<&GrayImage>,
-) -> Option<(RgbImage, GrayImage)> {
+) -> Option<Matte> {
     let longest = picture.width().max(picture.height());
     if longest > LONGEST {
         let scaled = |side: u32| (u64::from(side) * u64::from(LONGEST) / u64::from(longest)).max(1) as u32;
@@ -55,21 +73,61 @@ pub fn matte(
         picture = imageops::thumbnail(&picture, scaled(picture.width()), scaled(picture.height()));
     }
     let whole = Rect { x: 0, y: 0, width: picture.width(), height: picture.height() };
-    let (_, person) = largest(&found(&picture, whole, segment))?;
-    let part = around(person, whole);
-    // In the second look the person fills the picture.
+    let look = Look::find(&picture, pose);
+    let part = match &look {
+        Some(look) => around(look.person, whole),
+        None => {
+            let (_, subject) = largest(&found(&picture, whole, segment))?;
+            around(subject_box(subject, whole), whole)
+        }
+    };
+    // Now the person fills the picture.
     let mut probability = found(&picture, part, segment);
-    let (is_near, _) = largest(&probability)?;
-    probability.iter_mut().zip(&is_near).filter(|(_, near)| !**near).for_each(|(p, _)| *p = 0.0);
+    if look.is_none() {
+        let (is_near, _) = largest(&probability)?;
+        probability.iter_mut().zip(&is_near).filter(|(_, near)| !**near).for_each(|(p, _)| *p = 0.0);
+    }
 
     let mut mask = GrayImage::new(picture.width(), picture.height());
     let person = imageops::crop_imm(&picture, part.x, part.y, part.width, part.height).to_image();
     let taken = strokes.map(|strokes| (strokes, picture.clone()));
-    Filter::new(&person, probability).cut_out(&mut picture, &mut mask, part);
+    let size = filtered_size(part);
+    let mut probability = bilinear(probability, [SIDE; 2], size);
+    if let Some(look) = &look {
+        let scale = look.scale() * part.height as f32 / size[0] as f32;
+        probability = combined(&probability, &look.probabilities(part, size), size[1], 1.0 / scale);
+    }
+    Filter::new(&person, probability, size).cut_out(&mut picture, &mut mask, part);
     if let Some((strokes, taken)) = taken {
         paint(strokes, &mut mask, |x, y| picture.put_pixel(x, y, *taken.get_pixel(x, y)));
     }
-    Some((picture, mask))
+    Some(Matte { rgb: picture, mask, look })
+}
+
+/// The probabilities of both networks as one. `salient` decides the outline where it tells the person from the
+/// surroundings along the outline of `pose`, whose own outline is coarse. `scale`: pixels per pixel of the pose network.
+fn combined(salient: &[f32], pose: &[f32], width: usize, scale: f32) -> Vec<f32> {
+    let radius = |of: f32| ((of * scale).round() as usize).max(1);
+    let each = |of: &dyn Fn(usize) -> f32, reach: f32| {
+        means(&(0..pose.len()).map(of).collect::<Vec<f32>>(), width, radius(reach))
+    };
+    let inside = |i: usize| f32::from(u8::from(pose[i] > LIKELY));
+    let (in_area, in_sum) = (each(&inside, COMPARED), each(&|i| inside(i) * salient[i], COMPARED));
+    let sum = each(&|i| salient[i], COMPARED);
+    let near = each(&inside, BAND);
+    let deep = each(&|i| f32::from(u8::from(pose[i] > SURE)), BAND);
+    let mean = |sum: f32, area: f32, other: f32| if area > 1e-3 { sum / area } else { other };
+    (0..pose.len())
+        .map(|i| {
+            let apart = mean(in_sum[i], in_area[i], 1.0) - mean(sum[i] - in_sum[i], 1.0 - in_area[i], 0.0);
+            let share = between(apart, TOLD_APART);
+            match () {
+                () if deep[i] > 1.0 - 1e-6 => 1.0,
+                () if near[i] < 1e-6 => 0.0,
+                () => share * salient[i] + (1.0 - share) * pose[i],
+            }
+        })
+        .collect()
 }
 
 /// The network's probabilities for a part of a picture.
@@ -92,18 +150,29 @@ fn largest(probability: &[f32]) -> Option<(Vec<bool>, Rect)> {
     Some((near.iter().map(|share| *share > 1e-6).collect(), *person))
 }
 
-/// Adds the margin to a box in pixels of [`SIDE`]. Returns the box in pixels of the picture.
-fn around(person: Rect, whole: Rect) -> Rect {
-    let (sx, sy) = (whole.width as f32 / SIDE as f32, whole.height as f32 / SIDE as f32);
-    let margin = MARGIN * (person.width as f32 * sx).max(person.height as f32 * sy);
-    let span = |first: u32, length: u32, scale: f32, most: u32| {
-        let low = (first as f32 * scale - margin).max(0.0) as u32;
-        let high = (((first + length) as f32 * scale + margin).ceil() as u32).min(most);
-        (low.min(most - 1), high.max(low + 1).min(most))
+/// A box in pixels of [`SIDE`] as corners in pixels of the picture.
+fn subject_box(subject: Rect, whole: Rect) -> [Vec2; 2] {
+    let Rect { x, y, width, height } = subject;
+    let scale = Vec2::new(whole.width as f32, whole.height as f32) / SIDE as f32;
+    [(x, y), (x + width, y + height)].map(|(x, y)| scale * Vec2::new(x as f32, y as f32))
+}
+
+/// Adds the margin to a box.
+fn around([low, high]: [Vec2; 2], whole: Rect) -> Rect {
+    let margin = MARGIN * (high - low).max_element();
+    let span = |low: f32, high: f32, most: u32| {
+        let low = ((low - margin).max(0.0) as u32).min(most - 1);
+        (low, ((high + margin).ceil() as u32).clamp(low + 1, most))
     };
-    let (x0, x1) = span(person.x, person.width, sx, whole.width);
-    let (y0, y1) = span(person.y, person.height, sy, whole.height);
+    let ((x0, x1), (y0, y1)) = (span(low.x, high.x, whole.width), span(low.y, high.y, whole.height));
     Rect { x: x0, y: y0, width: x1 - x0, height: y1 - y0 }
+}
+
+/// Rows and columns of the pictures on which filters are computed.
+fn filtered_size(part: Rect) -> [usize; 2] {
+    let longer = part.width.max(part.height);
+    let scaled = |length: u32| (length * FILTERED.min(longer)).div_ceil(longer).max(1) as usize;
+    [scaled(part.height), scaled(part.width)]
 }
 
 /// The filters of a small picture, which are interpolated at full resolution.
@@ -118,15 +187,11 @@ struct Filter {
 }
 
 impl Filter {
-    fn new(rgb: &RgbImage, probability: Vec<f32>) -> Self {
-        let longer = rgb.width().max(rgb.height());
-        let scaled = |length: u32| (length * FILTERED.min(longer)).div_ceil(longer).max(1);
-        let (width, height) = (scaled(rgb.width()), scaled(rgb.height()));
-        let small = imageops::resize(rgb, width, height, FilterType::Triangle);
-        let color: Vec<Vec3> = small.pixels().map(unit_color).collect();
-        let size = [height as usize, width as usize];
+    /// `p`: probabilities at `size` (rows, columns).
+    fn new(rgb: &RgbImage, p: Vec<f32>, size: [usize; 2]) -> Self {
         let wide = size[1];
-        let p = bilinear(probability, [SIDE; 2], size);
+        let small = imageops::resize(rgb, wide as u32, size[0] as u32, FilterType::Triangle);
+        let color: Vec<Vec3> = small.pixels().map(unit_color).collect();
 
         let mean = |of: &dyn Fn(usize) -> f32| means(&(0..p.len()).map(of).collect::<Vec<_>>(), wide, RADIUS);
         let mean_of_color: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| color[i][c]));
@@ -149,12 +214,9 @@ impl Filter {
             (slope, mean_of_p[i] - slope.dot(m))
         };
         let (slope, offset): (Vec<Vec3>, Vec<f32>) = (0..p.len()).map(line).unzip();
-        let (mut slope, mut offset) = (mean_colors(&slope, wide), means(&offset, wide, RADIUS));
-        let mut alpha: Vec<f32> =
+        let (slope, offset) = (mean_colors(&slope, wide), means(&offset, wide, RADIUS));
+        let alpha: Vec<f32> =
             (0..p.len()).map(|i| between(slope[i].dot(color[i]) + offset[i], MIXED)).collect();
-        for i in no_gaps(&alpha, &p, wide) {
-            (slope[i], offset[i], alpha[i]) = (Vec3::ZERO, 1.0, 1.0);
-        }
 
         // Means over pixels that surely show the person or the background, within the filter's radius.
         let of = |share: &dyn Fn(f32) -> f32| {
@@ -191,16 +253,6 @@ impl Filter {
             }
         }
     }
-}
-
-/// Pixels of gaps that are filled ([`NO_GAP`]).
-fn no_gaps(alpha: &[f32], p: &[f32], width: usize) -> Vec<usize> {
-    let is_open: Vec<bool> = alpha.iter().map(|a| *a < WHOLE).collect();
-    let Pieces { of, pieces } = pieces(&is_open, width as u32);
-    // Piece 0 is the person.
-    let mut least = vec![f32::INFINITY; pieces.len() + 1];
-    of.iter().zip(p).for_each(|(piece, p)| least[*piece as usize] = least[*piece as usize].min(*p));
-    (0..of.len()).filter(|i| of[*i] > 0 && least[of[*i] as usize] > NO_GAP).collect()
 }
 
 /// The share of the way from the first limit to the second.
@@ -246,6 +298,8 @@ fn means(values: &[f32], width: usize, radius: usize) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
+    use snapsnap_net::blazepose::Pose;
+
     use super::*;
 
     const PERSON: [u8; 3] = [200, 60, 40];
@@ -275,9 +329,25 @@ mod tests {
         means(&red.iter().zip(blue).map(of).collect::<Vec<f32>>(), SIDE, 3)
     }
 
+    fn cut(picture: RgbImage, segment: &Segment, pose: &FindPose) -> Option<(RgbImage, GrayImage)> {
+        matte(picture, segment, pose, None).map(|Matte { rgb, mask, .. }| (rgb, mask))
+    }
+
+    /// A pose network that sees the same, coarsely and sure of the spot, or nobody.
+    fn pose(rgb: &[f32]) -> Pose {
+        let (red, blue) = (&rgb[..256 * 256], &rgb[2 * 256 * 256..]);
+        let of = |(red, blue): (&f32, &f32)| f32::from(*red > 0.0 && red + 0.02 > *blue);
+        let mask = means(&red.iter().zip(blue).map(of).collect::<Vec<f32>>(), 256, 2);
+        Pose { landmarks: vec![[128.0; 5]; 39], presence: 1.0, mask }
+    }
+
+    fn nobody(_: &[f32]) -> Pose {
+        Pose { landmarks: vec![[0.0; 5]; 39], presence: 0.0, mask: vec![0.0; 256 * 256] }
+    }
+
     #[test]
     fn edges_and_colours_are_those_of_the_photograph() {
-        let (rgb, mask) = matte(photograph(2), &network, None).expect("a person");
+        let (rgb, mask) = cut(photograph(2), &network, &pose).expect("a person");
         assert_eq!((rgb.dimensions(), mask.dimensions()), ((600, 800), (600, 800)));
         let is_person = |x: u32, y: u32| (200..400).contains(&x) && (100..700).contains(&y);
         let wrong = mask.enumerate_pixels().filter(|(x, y, value)| {
@@ -298,19 +368,45 @@ mod tests {
     #[test]
     fn large_pictures_are_reduced_and_nobody_is_nobody() {
         // 3600 × 4800 pixels.
-        let (rgb, mask) = matte(photograph(12), &network, None).expect("a person");
+        let (rgb, mask) = cut(photograph(12), &network, &pose).expect("a person");
         assert_eq!((rgb.dimensions(), mask.dimensions()), ((3072, 4096), (3072, 4096)));
         let rows = mask.rows().filter(|row| row.clone().any(|value| value[0] > 127)).count() as f32;
         assert!((rows / 4096.0 - 0.75).abs() < 0.01, "{rows}");
         let line = RgbImage::from_fn(2, 70_000, |_, y| {
             Rgb(if (9_000..60_000).contains(&y) { PERSON } else { WALL })
         });
-        assert_eq!(matte(line, &network, None).expect("a person").1.dimensions(), (1, 4096));
-        assert!(matte(RgbImage::from_pixel(90, 80, Rgb(WALL)), &network, None).is_none());
-        assert!(matte(RgbImage::new(1, 1), &|_| vec![0.0; SIDE * SIDE], None).is_none());
+        assert_eq!(cut(line, &network, &nobody).expect("a person").1.dimensions(), (1, 4096));
+        assert!(cut(RgbImage::from_pixel(90, 80, Rgb(WALL)), &network, &nobody).is_none());
+        assert!(cut(RgbImage::new(1, 1), &|_| vec![0.0; SIDE * SIDE], &nobody).is_none());
         // Everything is the person.
-        let (_, mask) = matte(RgbImage::from_pixel(70, 64, Rgb(PERSON)), &network, None).expect("a person");
+        let (_, mask) = cut(RgbImage::from_pixel(70, 64, Rgb(PERSON)), &network, &nobody).expect("a person");
         assert!(mask.pixels().all(|value| value[0] == 255));
+    }
+
+    /// The salient network misses the left half of the person and finds a block beside it.
+    #[test]
+    fn the_pose_network_says_where_the_person_is() {
+        let wrong = |rgb: &[f32]| -> Vec<f32> {
+            let found = network(rgb);
+            (0..SIDE * SIDE)
+                .map(|i| {
+                    if i % SIDE < SIDE / 2 {
+                        0.0
+                    } else {
+                        found[i].max(f32::from(u8::from(i % SIDE > SIDE - 20)))
+                    }
+                })
+                .collect()
+        };
+        let (_, mask) = cut(photograph(2), &wrong, &pose).expect("a person");
+        let is_person = |x: u32, y: u32| (200..400).contains(&x) && (100..700).contains(&y);
+        let far = |x: u32, y: u32| {
+            x.abs_diff(200).min(x.abs_diff(400)).min(y.abs_diff(100)).min(y.abs_diff(700)) > 8
+        };
+        let wrong = mask
+            .enumerate_pixels()
+            .filter(|(x, y, value)| far(*x, *y) && (value[0] >= 128) != is_person(*x, *y));
+        assert_eq!(wrong.count(), 0);
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use image::error::{DecodingError, ImageFormatHint};
 use image::{DynamicImage, ImageError, RgbImage, RgbaImage};
+use moxcms::ColorProfile;
 
 /// Bytes at the start of a file that identify its format.
 pub const START: usize = 12;
@@ -124,6 +125,17 @@ impl Bits {
             self.bit()?;
         }
         self.golomb()?.checked_mul(self.golomb()?)
+    }
+}
+
+/// The file's ICC profile, or the profile of the primaries that it names.
+pub fn profile(bytes: &[u8]) -> Option<ColorProfile> {
+    /// Display P3 (ITU-T H.273, table 2).
+    const P3: u16 = 12;
+    let metadata = heic_decoder::read_metadata(bytes).ok()?;
+    match metadata.icc_profile {
+        Some(icc) => ColorProfile::new_from_slice(&icc).ok(),
+        None => (metadata.color_info?.color_primaries == P3).then(ColorProfile::new_display_p3),
     }
 }
 

@@ -44,8 +44,8 @@ impl<'a> Jpeg<'a> {
         Ok(Self { decoder, size: [width as u32, height as u32], is_grey })
     }
 
-    /// The picture as it is stored, and its orientation.
-    pub fn decode(mut self) -> Result<(DynamicImage, Orientation), ImageError> {
+    /// The picture as it is stored, its orientation, and its ICC profile.
+    pub fn decode(mut self) -> Result<(DynamicImage, Orientation, Option<Vec<u8>>), ImageError> {
         let pixels = self.decoder.decode().map_err(|e| damaged(format!("{e:?}")))?;
         let exif = self.decoder.exif();
         let orientation = exif.and_then(|exif| Orientation::from_exif_chunk(exif));
@@ -56,7 +56,7 @@ impl<'a> Jpeg<'a> {
             RgbImage::from_raw(width, height, pixels).map(DynamicImage::ImageRgb8)
         };
         let picture = picture.ok_or_else(|| damaged("it contains fewer pixels than its header promises"))?;
-        Ok((picture, orientation.unwrap_or(Orientation::NoTransforms)))
+        Ok((picture, orientation.unwrap_or(Orientation::NoTransforms), self.decoder.icc_profile()))
     }
 }
 

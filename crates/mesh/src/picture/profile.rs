@@ -1,0 +1,67 @@
+//! Conversion of pictures from their ICC profiles to sRGB. Telephones save colours in Display P3.
+
+use image::{DynamicImage, RgbImage, RgbaImage};
+use moxcms::{ColorProfile, DataColorSpace, Layout, TransformOptions};
+use rayon::prelude::*;
+
+/// Largest change of a channel, of 255, that is left out: the profile is sRGB's.
+const EQUAL: u8 = 1;
+
+/// A picture in sRGB. A picture stays as it is if its profile is absent, damaged, sRGB's, or for other channels, like
+/// the profile of a CMYK picture, whose pixels are converted without it.
+pub fn to_srgb(picture: DynamicImage, icc: Option<&[u8]>) -> DynamicImage {
+    match icc.map(ColorProfile::new_from_slice) {
+        Some(Ok(profile)) => from_profile(picture, &profile),
+        _ => picture,
+    }
+}
+
+/// A picture in sRGB, from a profile.
+pub fn from_profile(picture: DynamicImage, profile: &ColorProfile) -> DynamicImage {
+    let color = picture.color();
+    let (has_color, has_alpha) = (color.has_color(), color.has_alpha());
+    if profile.color_space != (if has_color { DataColorSpace::Rgb } else { DataColorSpace::Gray }) {
+        return picture;
+    }
+    let [from, to] = match (has_color, has_alpha) {
+        (true, false) => [Layout::Rgb; 2],
+        (true, true) => [Layout::Rgba; 2],
+        (false, false) => [Layout::Gray, Layout::Rgb],
+        (false, true) => [Layout::GrayAlpha, Layout::Rgba],
+    };
+    let srgb = ColorProfile::new_srgb();
+    let Ok(transform) = profile.create_transform_8bit(from, &srgb, to, TransformOptions::default()) else {
+        return picture;
+    };
+    let channels = [from, to].map(Layout::channels);
+    // A row of greys and a row of saturated colours.
+    let probe: Vec<u8> = (0..256 * channels[0])
+        .map(|i| if i / channels[0] % 2 == 0 { i / channels[0] } else { 85 * i % 256 } as u8)
+        .collect();
+    let mut probed = vec![0; 256 * channels[1]];
+    let is_equal = |(a, b): (&[u8], &[u8])| (0..3).all(|c| a[c.min(a.len() - 1)].abs_diff(b[c]) <= EQUAL);
+    if transform.transform(&probe, &mut probed).is_ok()
+        && probe.chunks(channels[0]).zip(probed.chunks(channels[1])).all(is_equal)
+    {
+        return picture;
+    }
+    let (width, height) = (picture.width(), picture.height());
+    let pixels = match from {
+        Layout::Rgb => picture.to_rgb8().into_raw(),
+        Layout::Rgba => picture.to_rgba8().into_raw(),
+        Layout::Gray => picture.to_luma8().into_raw(),
+        _ => picture.to_luma_alpha8().into_raw(),
+    };
+    let mut converted = vec![0; width as usize * height as usize * channels[1]];
+    let rows = converted.par_chunks_mut(width as usize * channels[1]);
+    let rows = rows.zip(pixels.par_chunks(width as usize * channels[0]));
+    if rows.map(|(to, from)| transform.transform(from, to)).any(|done| done.is_err()) {
+        return picture;
+    }
+    let converted = if has_alpha {
+        RgbaImage::from_raw(width, height, converted).map(DynamicImage::from)
+    } else {
+        RgbImage::from_raw(width, height, converted).map(DynamicImage::from)
+    };
+    converted.unwrap_or(picture)
+}
