@@ -21,16 +21,19 @@ const MARGIN: f32 = 0.1;
 const LIKELY: f32 = 0.5;
 /// Distance from the person's largest piece, in pixels of [`SIDE`], beyond which no pixel belongs to the person.
 const NEAR: usize = 6;
-/// Distance from the outline that the pose network sees, in pixels of that network, within which the other network
-/// decides the outline.
-const BAND: f32 = 6.0;
+/// Width of the band on either side of the pose network's outline in which the other network may decide, in pixels of
+/// the pose network.
+const BAND: f32 = 8.0;
 /// Probability of the pose network from which a pixel behind the band is the person's. Gaps beside arms have less.
 const SURE: f32 = 0.99;
-/// Radius within which both networks are compared, in pixels of the pose network.
+/// Probabilities of the pose network up to which a pixel shows the surroundings, and from which on it shows the person,
+/// when the other network is judged by them.
+const JUDGED: (f32, f32) = (0.1, 0.9);
+/// Radius within which the other network is judged, in pixels of the pose network.
 const COMPARED: f32 = 8.0;
-/// Difference of the mean probabilities inside and outside of the pose network's outline from which the other network
-/// begins to count, and from which it decides alone.
-const TOLD_APART: (f32, f32) = (0.3, 0.7);
+/// Difference of the other network's mean probabilities for person and surroundings from which it begins to count, and
+/// from which it decides alone.
+const TOLD_APART: (f32, f32) = (0.5, 0.8);
 /// Longest side of a cut-out. Larger pictures are reduced first, two of one size alike. Canvases have 1024 rows.
 const LONGEST: u32 = 4096;
 /// Longer side of the pictures on which filters are computed.
@@ -105,29 +108,28 @@ pub fn matte(
 }
 
 /// The probabilities of both networks as one. `salient` decides the outline where it tells the person from the
-/// surroundings along the outline of `pose`, whose own outline is coarse. `scale`: pixels per pixel of the pose network.
+/// surroundings as `pose` sees them; the outline of `pose` is coarse. `scale`: pixels per pixel of the pose network.
 fn combined(salient: &[f32], pose: &[f32], width: usize, scale: f32) -> Vec<f32> {
-    let radius = |of: f32| ((of * scale).round() as usize).max(1);
-    let each = |of: &dyn Fn(usize) -> f32, reach: f32| {
-        means(&(0..pose.len()).map(of).collect::<Vec<f32>>(), width, radius(reach))
+    let local = |value: &dyn Fn(usize) -> f32, reach: f32| {
+        let values: Vec<f32> = (0..pose.len()).map(value).collect();
+        means(&values, width, ((reach * scale).round() as usize).max(1))
     };
-    let inside = |i: usize| f32::from(u8::from(pose[i] > LIKELY));
-    let (in_area, in_sum) = (each(&inside, COMPARED), each(&|i| inside(i) * salient[i], COMPARED));
-    let sum = each(&|i| salient[i], COMPARED);
-    let near = each(&inside, BAND);
-    let deep = each(&|i| f32::from(u8::from(pose[i] > SURE)), BAND);
-    let mean = |sum: f32, area: f32, other: f32| if area > 1e-3 { sum / area } else { other };
-    (0..pose.len())
-        .map(|i| {
-            let apart = mean(in_sum[i], in_area[i], 1.0) - mean(sum[i] - in_sum[i], 1.0 - in_area[i], 0.0);
-            let share = between(apart, TOLD_APART);
-            match () {
-                () if deep[i] > 1.0 - 1e-6 => 1.0,
-                () if near[i] < 1e-6 => 0.0,
-                () => share * salient[i] + (1.0 - share) * pose[i],
-            }
-        })
-        .collect()
+    let flag = |is_set: bool| f32::from(u8::from(is_set));
+    let person = |i: usize| flag(pose[i] > JUDGED.1);
+    let surroundings = |i: usize| flag(pose[i] < JUDGED.0);
+    let mean_of = |of: &dyn Fn(usize) -> f32, without: f32| -> Vec<f32> {
+        let (areas, sums) = (local(of, COMPARED), local(&|i| of(i) * salient[i], COMPARED));
+        areas.iter().zip(sums).map(|(area, sum)| if *area > 1e-3 { sum / area } else { without }).collect()
+    };
+    let (inside, outside) = (mean_of(&person, 1.0), mean_of(&surroundings, 0.0));
+    let deep = local(&|i| flag(pose[i] > SURE), BAND);
+    let near = local(&|i| flag(pose[i] > LIKELY), BAND);
+    let value = |i: usize| match between(inside[i] - outside[i], TOLD_APART) {
+        _ if deep[i] > 1.0 - 1e-6 => 1.0,
+        _ if near[i] < 1e-6 => 0.0,
+        share => share * salient[i] + (1.0 - share) * pose[i],
+    };
+    (0..pose.len()).map(value).collect()
 }
 
 /// The network's probabilities for a part of a picture.
