@@ -99,7 +99,7 @@ impl<'a> Cutout<'a> {
         };
         // [`matte`] has applied the strokes to a network's mask already.
         if let Some(strokes) = strokes.filter(|_| is_given) {
-            mask_strokes::paint(strokes, &mut mask, |_, _| {});
+            mask_strokes::paint(strokes, &mut mask);
         }
         let person = Rect::around(&mask, least).ok_or_else(|| nobody(mask_path, placement))?;
         if is_file && is_single_colour(&rgb, &mask) {
@@ -111,19 +111,27 @@ impl<'a> Cutout<'a> {
         if is_given && is_file {
             look = Look::at(&rgb, person, &pose);
         }
+        let joints = look.map(|look| look.joints);
+        let mixed = match placement {
+            Placement::Training { .. } => {
+                let is_hair = |place| joints.as_ref().is_some_and(|joints| joints.is_hair(place));
+                mask_rim::own_colors(&mut rgb, &mask, !is_given, is_hair)
+            }
+            _ => 0,
+        };
         let report = PhotoReport {
             size: [width, height],
             cut_out: (!is_given).then(|| rgb.dimensions().into()),
             person,
             specks,
             rim,
+            mixed,
             gains: None,
             turned: None,
             canvas: Canvas::AsIs,
         };
         let shot = if is_file { Shot::of(&source) } else { Shot::default() };
         let frame = Frame { shot, size: rgb.dimensions().into(), mapping: Mapping::AS_IT_IS };
-        let joints = look.map(|look| look.joints);
         Ok(Self { path, mask_path, rgb, mask, frame, report, joints, is_asked })
     }
 

@@ -1,11 +1,10 @@
-//! Removes backgrounds (docs/method.md, "Background removal"): a network finds the person, a guided filter aligns
-//! edges with the photograph's (He et al., "Guided Image Filtering", 2013; He and Sun, "Fast Guided Filter", 2015),
-//! and mixed colours lose the background's share (Forte, "Approximate Fast Foreground Colour Estimation", 2021).
+//! Removes backgrounds (docs/method.md, "Background removal"): two networks find the person, a guided filter aligns
+//! edges with the photograph's (He et al., "Guided Image Filtering", 2013; He and Sun, "Fast Guided Filter", 2015).
 
 use glam::{Mat3, Vec2, Vec3};
 use image::imageops::{self, FilterType};
-use image::{GrayImage, Luma, Rgb, RgbImage};
-use snapsnap_base::bilinear::{Tap, taps};
+use image::{GrayImage, Luma, RgbImage};
+use snapsnap_base::bilinear::taps;
 use snapsnap_net::u2net::SIDE;
 
 use super::joints::{FindPose, Look};
@@ -44,15 +43,13 @@ const RADIUS: usize = 4;
 const EPSILON: f32 = 1e-4;
 /// Up to the first coverage, a mask's pixel is background, from the second on, person: filtered edges are soft.
 const SOFT: (f32, f32) = (0.3, 0.7);
-/// These limits for colours: a mixed colour does more harm than a corrected one.
-const MIXED: (f32, f32) = (0.1, 0.8);
 
 /// The signature of [`super::segmenter::segment`].
 type Segment<'a> = dyn Fn(&[f32]) -> Vec<f32> + 'a;
 
 /// A cut-out.
 pub struct Matte {
-    /// Colours without the background's share.
+    /// Colours of the picture.
     pub rgb: RgbImage,
     /// Coverage by the person.
     pub mask: GrayImage,
@@ -93,16 +90,15 @@ pub fn matte(
 
     let mut mask = GrayImage::new(picture.width(), picture.height());
     let person = imageops::crop_imm(&picture, part.x, part.y, part.width, part.height).to_image();
-    let taken = strokes.map(|strokes| (strokes, picture.clone()));
     let size = filtered_size(part);
     let mut probability = bilinear(probability, [SIDE; 2], size);
     if let Some(look) = &look {
         let scale = look.scale() * part.height as f32 / size[0] as f32;
         probability = combined(&probability, &look.probabilities(part, size), size[1], 1.0 / scale);
     }
-    Filter::new(&person, probability, size).cut_out(&mut picture, &mut mask, part);
-    if let Some((strokes, taken)) = taken {
-        paint(strokes, &mut mask, |x, y| picture.put_pixel(x, y, *taken.get_pixel(x, y)));
+    Filter::new(&person, probability, size).cut_out(&picture, &mut mask, part);
+    if let Some(strokes) = strokes {
+        paint(strokes, &mut mask);
     }
     Some(Matte { rgb: picture, mask, look })
 }
@@ -183,9 +179,6 @@ struct Filter {
     /// Coverage = `slope` · colour + `offset`.
     slope: Vec<Vec3>,
     offset: Vec<f32>,
-    /// Mean colours of person and background around a pixel.
-    person: Vec<Vec3>,
-    background: Vec<Vec3>,
 }
 
 impl Filter {
@@ -217,41 +210,21 @@ impl Filter {
         };
         let (slope, offset): (Vec<Vec3>, Vec<f32>) = (0..p.len()).map(line).unzip();
         let (slope, offset) = (mean_colors(&slope, wide), means(&offset, wide, RADIUS));
-        let alpha: Vec<f32> =
-            (0..p.len()).map(|i| between(slope[i].dot(color[i]) + offset[i], MIXED)).collect();
-
-        // Means over pixels that surely show the person or the background, within the filter's radius.
-        let of = |share: &dyn Fn(f32) -> f32| {
-            let weights: Vec<f32> = alpha.iter().map(|a| share(*a)).collect();
-            let weighted: Vec<Vec3> = color.iter().zip(&weights).map(|(c, w)| *c * *w).collect();
-            let (sums, weights) = (mean_colors(&weighted, wide), means(&weights, wide, RADIUS));
-            let own = |i: usize| if weights[i] > 1e-4 { sums[i] / weights[i] } else { color[i] };
-            (0..alpha.len()).map(own).collect::<Vec<Vec3>>()
-        };
-        let (person, background) = (of(&|a| a * a * a), of(&|a| (1.0 - a).powi(3)));
-        Self { size, slope, offset, person, background }
+        Self { size, slope, offset }
     }
 
-    /// Writes the coverage and the person's colours into the part of the picture for which the filter was made.
-    fn cut_out(&self, picture: &mut RgbImage, mask: &mut GrayImage, part: Rect) {
+    /// Writes the coverage into the part of the mask for which the filter was made.
+    fn cut_out(&self, picture: &RgbImage, mask: &mut GrayImage, part: Rect) {
         let [rows, columns] = self.size;
         let across = taps(columns, part.width as usize, false);
         let down = taps(rows, part.height as usize, false);
-        let colors = |plane: &[Vec3], at: [Tap; 2]| interpolate(plane, columns, at);
         for (y, down) in (part.y..).zip(&down) {
             for (x, across) in (part.x..).zip(&across) {
-                let (at, pixel) = ([*down, *across], picture.get_pixel_mut(x, y));
-                let color = unit_color(pixel);
-                let share = colors(&self.slope, at).dot(color) + interpolate(&self.offset, columns, at);
+                let at = [*down, *across];
+                let color = unit_color(picture.get_pixel(x, y));
+                let share =
+                    interpolate(&self.slope, columns, at).dot(color) + interpolate(&self.offset, columns, at);
                 mask.put_pixel(x, y, Luma([(255.0 * between(share, SOFT)).round() as u8]));
-                let alpha = between(share, MIXED);
-                if alpha > 0.0 && alpha < 1.0 {
-                    let (person, background) = (colors(&self.person, at), colors(&self.background, at));
-                    // The person gets its share of the residual.
-                    let left = color - alpha * person - (1.0 - alpha) * background;
-                    let own = (person + alpha * left).clamp(Vec3::ZERO, Vec3::ONE);
-                    *pixel = Rgb(own.to_array().map(|c| (255.0 * c).round() as u8));
-                }
             }
         }
     }
@@ -300,6 +273,7 @@ fn means(values: &[f32], width: usize, radius: usize) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
+    use image::Rgb;
     use snapsnap_net::blazepose::Pose;
 
     use super::*;

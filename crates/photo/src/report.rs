@@ -19,6 +19,8 @@ pub struct PhotoReport {
     pub specks: usize,
     /// Pixels of the mask's rim that show the background and were left out.
     pub rim: usize,
+    /// Width in pixels of the rim whose colours mix person and background and were replaced by the colours behind.
+    pub mixed: usize,
     /// Factors of red, green and blue that match the back to the front.
     pub gains: Option<[f32; 3]>,
     /// Degrees to the right and down by which the photograph was turned towards the person.
@@ -69,7 +71,7 @@ impl fmt::Display for Place {
 
 impl fmt::Display for PhotoReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { size: [width, height], cut_out, person, specks, rim, gains, turned, canvas } = self;
+        let Self { size: [width, height], cut_out, person, specks, rim, mixed, gains, turned, canvas } = self;
         write!(f, "{width}×{height}")?;
         if let Some([width, height]) = cut_out {
             write!(f, ", cut out by the network at {width}×{height}")?;
@@ -80,6 +82,9 @@ impl fmt::Display for PhotoReport {
         }
         if *rim > 0 {
             write!(f, ", {rim} pixels of the mask's rim left out: they show the background")?;
+        }
+        if *mixed > 0 {
+            write!(f, ", mixed colours along {mixed} pixels of the outline replaced")?;
         }
         if let Some([r, g, b]) = gains {
             write!(f, ", made {r:.2}, {g:.2}, {b:.2} times as bright (red, green, blue) to match the front")?;
