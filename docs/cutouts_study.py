@@ -71,7 +71,7 @@ def cut_out(program, out, number, persons, backgrounds, names):
         truths.append(person[..., 3] / 255)
         Image.fromarray(put(person, behind).round().astype(np.uint8)).save(paths[-1], quality=92)
     command = [program, "reconstruct", *paths, "-o", out / "human.ply", "--save-cutouts", out / f"cut-{number}", "--quiet"]
-    subprocess.run(command, check=False)
+    subprocess.run(command, check=True)
     for path, truth, side in zip(paths, truths, ("front", "back")):
         cut = np.asarray(Image.open(out / f"cut-{number}" / f"{side}.png"))[..., 3] / 255
         rows.append(scores(cut, truth))

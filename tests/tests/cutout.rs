@@ -76,7 +76,7 @@ fn apart(found: &[f32], side: usize, expected: &[f32]) -> f32 {
 
 /// `docs/u2netp_convert.py` wrote the reference: ONNX Runtime's output for the same picture, at every eighth pixel.
 #[test]
-fn the_network_is_that_of_onnx_runtime() {
+fn the_salience_network_computes_what_onnx_runtime_does() {
     let device = Device::flex();
     let network = U2Net::load(&weights("u2netp.safetensors"), &device).expect("weights");
     let largest = apart(&network.forward(&over_a_ramp(320), &device), 320, &reference("u2netp.f32"));
@@ -86,12 +86,10 @@ fn the_network_is_that_of_onnx_runtime() {
 
 /// `docs/blazepose_convert.py` wrote the reference: LiteRT's landmarks, presence, and logits of every eighth pixel.
 #[test]
-fn the_pose_network_is_that_of_litert() {
+fn the_pose_network_computes_what_litert_does() {
     let device = Device::flex();
     let network = BlazePose::load(&weights("blazepose.safetensors"), &device).expect("weights");
-    let since = std::time::Instant::now();
     let Pose { landmarks, presence, mask } = network.forward(&over_a_ramp(256), &device);
-    println!("{:.0} ms", 1e3 * since.elapsed().as_secs_f64());
     let expected = reference("blazepose.f32");
     let (expected_landmarks, rest) = expected.split_at(195);
     let found = landmarks.as_flattened();

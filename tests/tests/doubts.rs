@@ -52,7 +52,7 @@ fn somebody_who_lies_is_noticed() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let photographs = pair(temporary.path(), |picture| DynamicImage::from(picture).rotate90().to_rgba8());
     let said = strict(temporary.path(), &photographs, &[]);
-    assert!(said.contains("wider than high"), "{said}");
+    assert!(said.contains("wider than high") && said.contains("does not stand upright"), "{said}");
 }
 
 #[test]
@@ -134,6 +134,7 @@ fn swapped_pictures_are_exchanged() {
     let [front, back] = pair(temporary.path(), |picture| picture);
     let said = strict(temporary.path(), &[back.clone(), front.clone()], &[]);
     assert!(said.contains("they were exchanged"), "{said}");
+    assert!(said.find("back.png") < said.find("front.png"), "in the order given: {said}");
     let gaussians = |photographs: &[PathBuf; 2], name: &str| {
         let folder = temporary.path().join(name);
         std::fs::create_dir(&folder).expect("a folder");
@@ -143,7 +144,7 @@ fn swapped_pictures_are_exchanged() {
     assert!(gaussians(&[back.clone(), front.clone()], "swapped") == gaussians(&[front, back], "right"));
 }
 
-/// Views of a made person around the sample: the right side, and the front and back with parts cut off.
+/// The sample from the side, the front twice, and the front with parts cut off.
 #[test]
 fn joints_tell_what_is_wrong() {
     let temporary = tempfile::tempdir().expect("temporary folder");

@@ -19,14 +19,28 @@ pub const MAX_BYTES: u64 = 768 << 20;
 /// Largest picture file that is read into memory before it is decoded.
 const MAX_FILE: u64 = 1 << 30;
 
-/// The picture in `path` in sRGB, turned upright according to its EXIF data.
+/// The picture in `path`, turned upright according to its EXIF data. Colour profiles are ignored, as glTF demands of
+/// textures and as masks need.
 ///
 /// # Errors
 /// [`FileError`] for a file that cannot be read, is no picture, is damaged or cut short, or would take more than
 /// `most` bytes in memory. The size is checked before decoding.
 pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
     let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
-    guarded(path, || decode_from(path, file, most))
+    guarded(path, || decode_from(path, file, most, false))
+}
+
+/// The photograph in `path`, or in `bytes` if there are any: as [`decode`] reads it, with 8 bits, and in sRGB if it has
+/// a colour profile.
+///
+/// # Errors
+/// As [`decode`], above [`MAX_BYTES`].
+pub fn photograph(path: &Path, bytes: Option<&[u8]>) -> Result<DynamicImage, FileError> {
+    if let Some(bytes) = bytes {
+        return guarded(path, || decode_from(path, Cursor::new(bytes), MAX_BYTES, true));
+    }
+    let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
+    guarded(path, || decode_from(path, file, MAX_BYTES, true))
 }
 
 /// Width and height of the picture in `path`, without regard to its EXIF data.
@@ -60,7 +74,7 @@ fn size_from(path: &Path, mut source: impl BufRead + Seek) -> Result<[u32; 2], F
 /// # Errors
 /// As [`decode`].
 pub fn decode_bytes(path: &Path, bytes: &[u8], most: u64) -> Result<DynamicImage, FileError> {
-    guarded(path, || decode_from(path, Cursor::new(bytes), most))
+    guarded(path, || decode_from(path, Cursor::new(bytes), most, false))
 }
 
 /// For `map_err`: the error for an image in `path` that is damaged or of an unknown format.
@@ -80,7 +94,12 @@ fn whole(path: &Path, source: impl Read) -> Result<Vec<u8>, FileError> {
     Ok(bytes)
 }
 
-fn decode_from(path: &Path, mut source: impl BufRead + Seek, most: u64) -> Result<DynamicImage, FileError> {
+fn decode_from(
+    path: &Path,
+    mut source: impl BufRead + Seek,
+    most: u64,
+    in_srgb: bool,
+) -> Result<DynamicImage, FileError> {
     let failed = unreadable(path);
     let check = |[width, height]: [u32; 2], stored: u64| {
         // Every picture is converted to 8-bit RGB later.
@@ -98,7 +117,7 @@ fn decode_from(path: &Path, mut source: impl BufRead + Seek, most: u64) -> Resul
         let (size, needed) = heic::size(&bytes).map_err(&failed)?;
         check(size, needed)?;
         let picture = heic::decode(&bytes).map_err(&failed)?;
-        return Ok(match heic::profile(&bytes) {
+        return Ok(match heic::profile(&bytes).filter(|_| in_srgb) {
             Some(profile) => profile::from_profile(picture, &profile),
             None => picture,
         });
@@ -117,7 +136,7 @@ fn decode_from(path: &Path, mut source: impl BufRead + Seek, most: u64) -> Resul
         let icc = decoder.icc_profile().ok().flatten();
         (DynamicImage::from_decoder(decoder).map_err(&failed)?, orientation, icc)
     };
-    let mut picture = profile::to_srgb(picture, icc.as_deref());
+    let mut picture = profile::to_srgb(picture, icc.as_deref().filter(|_| in_srgb));
     picture.apply_orientation(orientation);
     Ok(picture)
 }

@@ -115,7 +115,9 @@ impl<'a> Cutout<'a> {
         let mixed = match placement {
             Placement::Training { .. } => {
                 let is_hair = |place| joints.as_ref().is_some_and(|joints| joints.is_hair(place));
-                mask_rim::own_colors(&mut rgb, &mask, !is_given, is_hair)
+                let size = rgb.dimensions().into();
+                let is_kept = |x, y| strokes.is_some_and(|strokes| mask_strokes::keeps(strokes, size, x, y));
+                mask_rim::own_colors(&mut rgb, &mask, !is_given, is_hair, is_kept)
             }
             _ => 0,
         };

@@ -167,7 +167,7 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout, swapped: bool) -> Vec<Doubt>
         let signs = [
             (joints.lies(), Sign::Lies),
             (!joints.lies() && joints.sits(), Sign::Sits),
-            (joints.facing() == Some(Facing::Side), Sign::FromTheSide),
+            (!joints.lies() && joints.facing() == Some(Facing::Side), Sign::FromTheSide),
             (!parts.is_empty(), Sign::Outside { parts }),
         ];
         signs.into_iter().filter(|(is_so, _)| *is_so).for_each(|(_, sign)| add(&[one], sign));
@@ -179,7 +179,8 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout, swapped: bool) -> Vec<Doubt>
         add(&both, Sign::Mirrored);
     } else {
         if swapped {
-            add(&both, Sign::Swapped);
+            // In the order in which they were given.
+            add(&[back, front], Sign::Swapped);
         }
         if let (Some(a), Some(b)) = (&front.joints, &back.joints) {
             match (a.facing(), b.facing()) {

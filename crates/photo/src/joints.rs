@@ -23,6 +23,9 @@ const STEADY: f32 = 0.05;
 /// Probability above which there is a person, a joint, or a person's pixel.
 const LIKELY: f32 = 0.5;
 
+/// Landmarks that are joints, the first ones of [`Pose::landmarks`].
+const JOINTS: usize = 33;
+
 /// The signature of [`super::segmenter::pose`].
 pub type FindPose<'a> = dyn Fn(&[f32]) -> Pose + 'a;
 
@@ -41,9 +44,9 @@ pub struct Look {
     pub joints: Joints,
     /// The box around the person's joints and likely pixels, in pixels of the photograph.
     pub person: [Vec2; 2],
-    /// Upper left corner and side of the square that the network saw.
+    /// Upper left corner and sides of the square that the network saw.
     corner: Vec2,
-    side: f32,
+    side: Vec2,
     /// Probability of each pixel of the square to belong to the person, 0 in pieces of others.
     mask: Vec<f32>,
 }
@@ -61,7 +64,7 @@ impl Look {
             };
             let moved = [0, 1].map(|i| (next.person[i] - last.person[i]).abs().max_element());
             last = next;
-            if moved[0].max(moved[1]) < STEADY * last.side {
+            if moved[0].max(moved[1]) < STEADY * last.side.max_element() {
                 break;
             }
         }
@@ -79,7 +82,12 @@ impl Look {
     /// Probabilities of the pixels of a part of the picture, at this size (rows, columns).
     pub fn probabilities(&self, part: Rect, [rows, columns]: [usize; 2]) -> Vec<f32> {
         let step = self.side / SIDE as f32;
-        let at = |first: u32, length: u32, count: usize, corner: f32| -> Vec<Option<(usize, usize, f32)>> {
+        let at = |first: u32,
+                  length: u32,
+                  count: usize,
+                  corner: f32,
+                  step: f32|
+         -> Vec<Option<(usize, usize, f32)>> {
             let place =
                 |i: usize| (first as f32 + (i as f32 + 0.5) * length as f32 / count as f32 - corner) / step;
             let tap = |place: f32| {
@@ -89,8 +97,8 @@ impl Look {
             };
             (0..count).map(|i| tap(place(i))).collect()
         };
-        let down = at(part.y, part.height, rows, self.corner.y);
-        let across = at(part.x, part.width, columns, self.corner.x);
+        let down = at(part.y, part.height, rows, self.corner.y, step.y);
+        let across = at(part.x, part.width, columns, self.corner.x, step.x);
         let value = |down: Option<_>, across: Option<_>| match (down, across) {
             (Some(down), Some(across)) => interpolate(&self.mask, SIDE, [down, across]),
             _ => 0.0,
@@ -98,9 +106,9 @@ impl Look {
         down.iter().flat_map(|down| across.iter().map(|across| value(*down, *across))).collect()
     }
 
-    /// Pixels of the network's input per pixel of the photograph.
+    /// Pixels of the network's input per row of the photograph.
     pub fn scale(&self) -> f32 {
-        SIDE as f32 / self.side
+        SIDE as f32 / self.side.y
     }
 }
 
@@ -115,7 +123,7 @@ impl Small {
     fn new(picture: &RgbImage) -> Self {
         let (width, height) = picture.dimensions();
         let longest = width.max(height);
-        let reduced = |side: u32| (side * LONGEST / longest).max(1);
+        let reduced = |side: u32| (u64::from(side) * u64::from(LONGEST) / u64::from(longest)).max(1) as u32;
         let small = if longest > LONGEST {
             imageops::thumbnail(picture, reduced(width), reduced(height))
         } else {
@@ -143,15 +151,21 @@ impl Small {
         }
         let likely: Vec<bool> = mask.iter().map(|p| *p > LIKELY).collect();
         let found = pieces(&likely, SIDE as u32);
-        let (largest, (_, piece)) = found.pieces.iter().enumerate().max_by_key(|(_, (size, _))| *size)?;
-        // The wrist of a separate hand may be invisible. Soft pixels belong to no piece; they stay.
+        // Hidden joints count too: a hand may be a piece of its own.
         let piece_at = |[x, y, ..]: &[f32; 5]| {
             let is_inside = |v: f32| (0.0..SIDE as f32).contains(&v);
-            (is_inside(*x) && is_inside(*y)).then(|| found.of[*y as usize * SIDE + *x as usize])
+            (is_inside(*x) && is_inside(*y)).then(|| found.of[*y as usize * SIDE + *x as usize] as usize)
         };
-        let own: Vec<u32> = landmarks[..33].iter().filter_map(piece_at).chain([largest as u32 + 1]).collect();
-        let is_other = |of: u32| of > 0 && !own.contains(&of);
-        mask.iter_mut().zip(&found.of).filter(|(_, of)| is_other(**of)).for_each(|(p, _)| *p = 0.0);
+        let mut joints_in = vec![0; found.pieces.len() + 1];
+        landmarks[..JOINTS].iter().filter_map(piece_at).for_each(|piece| joints_in[piece] += 1);
+        let rank = |piece: &usize| (joints_in[*piece], found.pieces[*piece - 1].0);
+        let main = (1..joints_in.len()).max_by_key(rank)?;
+        let is_own = |piece: usize| piece == main || joints_in[piece] > 0;
+        // Soft pixels belong to no piece; they stay.
+        mask.iter_mut()
+            .zip(&found.of)
+            .filter(|(_, of)| **of > 0 && !is_own(**of as usize))
+            .for_each(|(p, _)| *p = 0.0);
 
         let step = side as f32 / SIDE as f32;
         let place = |x: f32, y: f32| self.scale * (corner.as_vec2() + step * Vec2::new(x, y));
@@ -160,19 +174,21 @@ impl Small {
             at: place(*x, *y),
             seen: probability(*visible).min(probability(*present)),
         };
-        let joints = Joints(landmarks[..33].iter().map(joint).collect());
-        let corners = [place(piece.x as f32, piece.y as f32), {
-            let Rect { x, y, width, height } = *piece;
-            place((x + width) as f32, (y + height) as f32)
-        }];
+        let joints = Joints(landmarks[..JOINTS].iter().map(joint).collect());
+        let edges = |piece: usize| {
+            let Rect { x, y, width, height } = found.pieces[piece - 1].1;
+            [place(x as f32, y as f32), place((x + width) as f32, (y + height) as f32)]
+        };
+        let pieces = (1..joints_in.len()).filter(|piece| is_own(*piece)).flat_map(edges);
         let seen = joints.0.iter().filter(|joint| joint.seen > LIKELY).map(|joint| joint.at);
-        let person = seen.fold(corners, |[low, high], at| [low.min(at), high.max(at)]);
+        let around = |[low, high]: [Vec2; 2], at: Vec2| [low.min(at), high.max(at)];
+        let person = pieces.chain(seen).fold(edges(main), around);
         let limit = self.scale * self.size();
         Some(Look {
             joints,
             person: person.map(|edge| edge.clamp(Vec2::ZERO, limit)),
             corner: place(0.0, 0.0),
-            side: self.scale.x * side as f32,
+            side: self.scale * side as f32,
             mask,
         })
     }
@@ -269,17 +285,20 @@ impl Joints {
         shoulders.distance(hips).max(1.0)
     }
 
-    /// Whether there may be hair at a place: around the face, or anywhere on the head seen from behind.
+    /// Whether there may be hair at a place: above the shoulders, and around the face unless seen from behind.
     pub fn is_hair(&self, place: Vec2) -> bool {
-        let (nose, neck) = (self.at(0), self.torso()[0]);
+        let (nose, [shoulders, hips]) = (self.at(0), self.torso());
         let ears = [7, 8].map(|ear| nose.distance(self.at(ear)));
-        let face = if self.facing() == Some(Facing::Front) { FACE * ears[0].max(ears[1]) } else { 0.0 };
-        (face..HAIR * nose.distance(neck)).contains(&nose.distance(place))
+        let face = if self.facing() == Some(Facing::Back) { 0.0 } else { FACE * ears[0].max(ears[1]) };
+        (place - shoulders).dot(shoulders - hips) > 0.0
+            && (face..HAIR * nose.distance(shoulders)).contains(&nose.distance(place))
     }
 
     /// `None` between front and side.
     pub fn facing(&self) -> Option<Facing> {
-        let width = (self.at(11).x - self.at(12).x) / self.length();
+        let [shoulders, hips] = self.torso();
+        let up = shoulders - hips;
+        let width = (self.at(11) - self.at(12)).dot(Vec2::new(-up.y, up.x)) / self.length().powi(2);
         match width.abs() {
             apart if apart < SHOULDERS[1] => Some(Facing::Side),
             apart if apart < SHOULDERS[0] => None,
@@ -324,5 +343,87 @@ impl Joints {
             seen > LIKELY && place(self, *joint).distance(behind) > *most
         };
         LIMBS.iter().filter(|(_, joints)| joints.iter().any(is_moved)).map(|(part, _)| *part).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Somebody who stands in a picture of 100 × 200 pixels, seen from the front.
+    fn standing() -> Joints {
+        let mut at = vec![Vec2::new(50.0, 30.0); 33];
+        for (left, x, y) in [
+            (11, 65.0, 50.0),
+            (13, 72.0, 75.0),
+            (15, 75.0, 95.0),
+            (19, 76.0, 100.0),
+            (23, 58.0, 100.0),
+            (25, 59.0, 140.0),
+            (27, 60.0, 180.0),
+            (29, 60.0, 185.0),
+            (31, 62.0, 190.0),
+            (7, 56.0, 28.0),
+        ] {
+            (at[left], at[left + 1]) = (Vec2::new(x, y), Vec2::new(100.0 - x, y));
+        }
+        Joints(at.into_iter().map(|at| Joint { at, seen: 1.0 }).collect())
+    }
+
+    fn changed(of: &Joints, change: impl Fn(usize, Vec2) -> Vec2) -> Joints {
+        let joint = |(i, joint): (usize, &Joint)| Joint { at: change(i, joint.at), ..*joint };
+        Joints(of.0.iter().enumerate().map(joint).collect())
+    }
+
+    #[test]
+    fn joints_say_what_a_photograph_shows() {
+        let front = standing();
+        let back = changed(&front, |_, at| Vec2::new(100.0 - at.x, at.y));
+        assert_eq!((front.facing(), back.facing()), (Some(Facing::Front), Some(Facing::Back)));
+        let thin = |x: f32| 50.0 + 0.3 * (x - 50.0);
+        assert_eq!(changed(&front, |_, at| Vec2::new(thin(at.x), at.y)).facing(), Some(Facing::Side));
+        // Upside down and lying people keep their side.
+        let (turned, lying) =
+            (changed(&front, |_, at| 200.0 - at), changed(&front, |_, at| Vec2::new(200.0 - at.y, at.x)));
+        assert_eq!((turned.facing(), lying.facing()), (front.facing(), front.facing()));
+        assert!(turned.lies() && lying.lies() && !front.lies() && !front.sits());
+        assert!(changed(&front, |i, at| if i >= 25 { at - Vec2::new(0.0, 30.0) } else { at }).sits());
+        assert_eq!(front.moved(&back), []);
+        let raised = changed(&back, |i, at| if i == 15 || i == 19 { Vec2::new(at.x, 20.0) } else { at });
+        assert_eq!(front.moved(&raised), [Part::LeftArm]);
+        let hidden = Joints(raised.0.iter().map(|joint| Joint { seen: 0.2, ..*joint }).collect());
+        assert_eq!(front.moved(&hidden), []);
+        assert_eq!(front.outside([100, 200]), []);
+        assert_eq!(front.outside([100, 187]), [Part::LeftLeg, Part::RightLeg]);
+        assert_eq!(
+            changed(&front, |_, at| at - Vec2::new(27.0, 25.0)).outside([100, 200]),
+            [Part::Head, Part::RightArm]
+        );
+        assert!(front.is_hair(Vec2::new(50.0, 12.0)) && !front.is_hair(Vec2::new(52.0, 32.0)));
+        assert!(back.is_hair(Vec2::new(50.0, 32.0)) && !back.is_hair(Vec2::new(50.0, 55.0)));
+    }
+
+    /// Pictures of extreme sizes, with a network that answers anything.
+    #[test]
+    fn extreme_pictures_and_answers_do_no_harm() {
+        let answer = |mask: f32, place: f32| {
+            move |_: &[f32]| Pose {
+                landmarks: vec![[place; 5]; 39],
+                presence: 1.0,
+                mask: vec![mask; SIDE * SIDE],
+            }
+        };
+        for (width, height) in [(1, 1), (1, 70_000), (70_000, 64), (300, 200)] {
+            let picture = RgbImage::new(width, height);
+            for place in [128.0, -1e9, f32::NAN, f32::INFINITY] {
+                assert!(Look::find(&picture, &answer(0.0, place)).is_none(), "no pixel of a person");
+                let look = Look::find(&picture, &answer(1.0, place)).expect("a person");
+                let whole = Rect { x: 0, y: 0, width, height };
+                let probabilities = look.probabilities(whole, [5, 7]);
+                assert!(probabilities.iter().all(|p| *p == 1.0), "{width}×{height}: {probabilities:?}");
+                assert!(Look::at(&picture, whole, &answer(1.0, place)).is_some());
+                let _ = (look.joints.facing(), look.joints.outside([width, height]), look.joints.sits());
+            }
+        }
     }
 }

@@ -62,7 +62,8 @@ pub struct Photographs {
 }
 
 /// Reads photographs and places each on a canvas of `side` pixels. `cutting` says where the mask of a source without
-/// one comes from. A back photograph that stands before the front one is exchanged with it. With [`Placement::Training`], two photographs whose sizes and boxes agree count as taken from one
+/// one comes from. With
+/// [`Placement::Training`], files are exchanged if the first shows the back and the second the front. With [`Placement::Training`], two photographs whose sizes and boxes agree count as taken from one
 /// place and get the same scale and offset. If a focal length is known, from the files or as `focal` (millimetres of
 /// 35 mm film), a photograph whose person is beside the middle is turned towards the person.
 ///
@@ -85,11 +86,13 @@ pub fn read(
         let own = &mut cutout.frame.shot;
         (own.focal, own.pitch) = (focal.or(own.focal).or(lens), own.pitch.or(pitch));
     }
-    let swapped = matches!(&*cutouts, [front, back] if doubts::are_swapped(front, back));
+    let is_placed = matches!(placement, Placement::Training { .. });
+    // A caller with pictures in memory knows their order.
+    let is_free = is_placed && !sources.iter().any(|source| matches!(source.content, Content::Pixels(..)));
+    let swapped = is_free && matches!(&*cutouts, [front, back] if doubts::are_swapped(front, back));
     if swapped {
         cutouts.reverse();
     }
-    let is_placed = matches!(placement, Placement::Training { .. });
     if let ([front, back], true) = (&mut *cutouts, is_placed) {
         back.report.gains = match_back((&front.rgb, &front.mask), (&mut back.rgb, &mut back.mask));
     }

@@ -27,6 +27,13 @@ pub fn paint(strokes: &GrayImage, mask: &mut GrayImage) {
     }
 }
 
+/// Whether strokes keep a pixel of a picture of this size.
+pub fn keeps(strokes: &GrayImage, [width, height]: [u32; 2], x: u32, y: u32) -> bool {
+    let at = |at: u32, length: u32, count: u32| (u64::from(at) * u64::from(count) / u64::from(length)) as u32;
+    let stroke = strokes.get_pixel(at(x, width, strokes.width()), at(y, height, strokes.height()))[0];
+    stroke > UNTOUCHED + NOISE
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -14,7 +14,7 @@ use crate::mask_strokes::paint;
 use crate::rect::Rect;
 use crate::resize::{bilinear, interpolate};
 
-/// Margin of the network's second look around the person's box, as a share of the box's longer side.
+/// Margin of the part in which the outline is looked for, around the person's box, as a share of the box's longer side.
 const MARGIN: f32 = 0.1;
 /// Probability above which a pixel counts as the person's.
 const LIKELY: f32 = 0.5;
@@ -93,8 +93,8 @@ pub fn matte(
     let size = filtered_size(part);
     let mut probability = bilinear(probability, [SIDE; 2], size);
     if let Some(look) = &look {
-        let scale = look.scale() * part.height as f32 / size[0] as f32;
-        probability = combined(&probability, &look.probabilities(part, size), size[1], 1.0 / scale);
+        let scale = size[0] as f32 / part.height as f32 / look.scale();
+        probability = combined(&probability, &look.probabilities(part, size), size[1], scale);
     }
     Filter::new(&person, probability, size).cut_out(&picture, &mut mask, part);
     if let Some(strokes) = strokes {
@@ -312,7 +312,7 @@ mod tests {
     /// A pose network that sees the same, coarsely and sure of the spot, or nobody.
     fn pose(rgb: &[f32]) -> Pose {
         let (red, blue) = (&rgb[..256 * 256], &rgb[2 * 256 * 256..]);
-        let of = |(red, blue): (&f32, &f32)| f32::from(*red > 0.0 && red + 0.02 > *blue);
+        let of = |(red, blue): (&f32, &f32)| f32::from(*red > 0.0 && red + 0.1 > *blue);
         let mask = means(&red.iter().zip(blue).map(of).collect::<Vec<f32>>(), 256, 2);
         Pose { landmarks: vec![[128.0; 5]; 39], presence: 1.0, mask }
     }
@@ -322,9 +322,9 @@ mod tests {
     }
 
     #[test]
-    fn edges_and_colours_are_those_of_the_photograph() {
+    fn outlines_follow_the_photograph() {
         let (rgb, mask) = cut(photograph(2), &network, &pose).expect("a person");
-        assert_eq!((rgb.dimensions(), mask.dimensions()), ((600, 800), (600, 800)));
+        assert!(rgb == photograph(2), "colours stay");
         let is_person = |x: u32, y: u32| (200..400).contains(&x) && (100..700).contains(&y);
         let wrong = mask.enumerate_pixels().filter(|(x, y, value)| {
             let mixed = *x == 200;
@@ -334,11 +334,6 @@ mod tests {
         let wrong = wrong.count();
         assert!(wrong < 40, "{wrong} pixels");
         assert_eq!(mask.get_pixel(300, 210)[0], 255, "the spot is no gap");
-        assert_eq!(rgb.get_pixel(300, 210).0, [30, 30, 30], "colours inside stay");
-        // A pixel of both shows the person's colour.
-        let mixed = rgb.get_pixel(200, 400).0;
-        let apart = (0..3).map(|c| mixed[c].abs_diff(PERSON[c])).max().expect("three channels");
-        assert!(apart < 30, "{mixed:?}");
     }
 
     #[test]

@@ -84,7 +84,7 @@ impl fmt::Display for PhotoReport {
             write!(f, ", {rim} pixels of the mask's rim left out: they show the background")?;
         }
         if *mixed > 0 {
-            write!(f, ", mixed colours along {mixed} pixels of the outline replaced")?;
+            write!(f, ", mixed colours replaced up to {mixed} pixels inside of the outline")?;
         }
         if let Some([r, g, b]) = gains {
             write!(f, ", made {r:.2}, {g:.2}, {b:.2} times as bright (red, green, blue) to match the front")?;

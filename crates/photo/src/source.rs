@@ -4,7 +4,7 @@ use std::path::Path;
 
 use image::{DynamicImage, GrayImage, RgbImage};
 use snapsnap_base::FileError;
-use snapsnap_mesh::picture::{self, MAX_BYTES};
+use snapsnap_mesh::picture;
 
 /// Placement of a photograph on its canvas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,8 +71,8 @@ impl<'a> Source<'a> {
 
     pub(crate) fn decode(&self) -> Result<DynamicImage, FileError> {
         match self.content {
-            Content::File => picture::decode(self.path, MAX_BYTES),
-            Content::Bytes(bytes) => picture::decode_bytes(self.path, bytes, MAX_BYTES),
+            Content::File => picture::photograph(self.path, None),
+            Content::Bytes(bytes) => picture::photograph(self.path, Some(bytes)),
             Content::Pixels(rgb, _) => Ok(rgb.clone().into()),
         }
     }

@@ -130,12 +130,16 @@ impl Bits {
 
 /// The file's ICC profile, or the profile of the primaries that it names.
 pub fn profile(bytes: &[u8]) -> Option<ColorProfile> {
-    /// Display P3 (ITU-T H.273, table 2).
-    const P3: u16 = 12;
+    /// Primaries of Display P3 and the transfer curve of sRGB (ITU-T H.273, tables 2 and 3).
+    const P3: (u16, u16) = (12, 13);
     let metadata = heic_decoder::read_metadata(bytes).ok()?;
     match metadata.icc_profile {
         Some(icc) => ColorProfile::new_from_slice(&icc).ok(),
-        None => (metadata.color_info?.color_primaries == P3).then(ColorProfile::new_display_p3),
+        None => {
+            let color = metadata.color_info?;
+            let is_p3 = (color.color_primaries, color.transfer_characteristics) == P3;
+            is_p3.then(ColorProfile::new_display_p3)
+        }
     }
 }
 

@@ -39,29 +39,27 @@ pub fn from_profile(picture: DynamicImage, profile: &ColorProfile) -> DynamicIma
         .map(|i| if i / channels[0] % 2 == 0 { i / channels[0] } else { 85 * i % 256 } as u8)
         .collect();
     let mut probed = vec![0; 256 * channels[1]];
-    let is_equal = |(a, b): (&[u8], &[u8])| (0..3).all(|c| a[c.min(a.len() - 1)].abs_diff(b[c]) <= EQUAL);
-    if transform.transform(&probe, &mut probed).is_ok()
-        && probe.chunks(channels[0]).zip(probed.chunks(channels[1])).all(is_equal)
+    let is_equal =
+        |(a, b): (&[u8], &[u8])| (0..3).all(|c| a[if has_color { c } else { 0 }].abs_diff(b[c]) <= EQUAL);
+    if transform.transform(&probe, &mut probed).is_err()
+        || probe.chunks(channels[0]).zip(probed.chunks(channels[1])).all(is_equal)
     {
         return picture;
     }
     let (width, height) = (picture.width(), picture.height());
     let pixels = match from {
-        Layout::Rgb => picture.to_rgb8().into_raw(),
-        Layout::Rgba => picture.to_rgba8().into_raw(),
-        Layout::Gray => picture.to_luma8().into_raw(),
-        _ => picture.to_luma_alpha8().into_raw(),
+        Layout::Rgb => picture.into_rgb8().into_raw(),
+        Layout::Rgba => picture.into_rgba8().into_raw(),
+        Layout::Gray => picture.into_luma8().into_raw(),
+        _ => picture.into_luma_alpha8().into_raw(),
     };
     let mut converted = vec![0; width as usize * height as usize * channels[1]];
     let rows = converted.par_chunks_mut(width as usize * channels[1]);
     let rows = rows.zip(pixels.par_chunks(width as usize * channels[0]));
-    if rows.map(|(to, from)| transform.transform(from, to)).any(|done| done.is_err()) {
-        return picture;
-    }
-    let converted = if has_alpha {
-        RgbaImage::from_raw(width, height, converted).map(DynamicImage::from)
+    rows.for_each(|(to, from)| transform.transform(from, to).expect("as for the probe"));
+    if has_alpha {
+        RgbaImage::from_raw(width, height, converted).expect("four bytes a pixel").into()
     } else {
-        RgbImage::from_raw(width, height, converted).map(DynamicImage::from)
-    };
-    converted.unwrap_or(picture)
+        RgbImage::from_raw(width, height, converted).expect("three bytes a pixel").into()
+    }
 }

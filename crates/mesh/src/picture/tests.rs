@@ -111,7 +111,7 @@ fn heic_pictures_are_read_and_damaged_ones_refused() {
 #[test]
 fn colours_are_converted_to_srgb() {
     use image::{ExtendedColorType, ImageEncoder, codecs};
-    let decoded = |bytes: &[u8]| decode_bytes(Path::new("a"), bytes, MAX_BYTES).expect("decodes").into_rgb8();
+    let decoded = |bytes: &[u8]| photograph(Path::new("a"), Some(bytes)).expect("decodes").into_rgb8();
     let png = |pixels: &[u8], kind: ExtendedColorType, profile: &moxcms::ColorProfile| {
         let mut bytes = Vec::new();
         let mut encoder = codecs::png::PngEncoder::new(&mut bytes);
