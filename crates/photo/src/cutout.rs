@@ -11,6 +11,7 @@ use snapsnap_net::Photograph;
 
 use crate::exif_camera::{Frame, Shot};
 use crate::joints::{Joints, Look};
+use crate::mask_rim::Background;
 use crate::matting::{Matte, matte};
 use crate::placing::{Mapping, Standing, on_canvas, placed, placed_as_demo};
 use crate::recentring::Turn;
@@ -109,7 +110,7 @@ impl<'a> Cutout<'a> {
         // Training samples need no joints.
         let is_asked = is_file || !is_given;
         if is_given && is_file {
-            look = Look::at(&rgb, person, &pose);
+            look = Look::at(&rgb, &mask, person, &pose);
         }
         let joints = look.map(|look| look.joints);
         let mixed = match placement {
@@ -117,7 +118,12 @@ impl<'a> Cutout<'a> {
                 let is_hair = |place| joints.as_ref().is_some_and(|joints| joints.is_hair(place));
                 let size = rgb.dimensions().into();
                 let is_kept = |x, y| strokes.is_some_and(|strokes| mask_strokes::keeps(strokes, size, x, y));
-                mask_rim::own_colors(&mut rgb, &mask, !is_given, is_hair, is_kept)
+                let background = match source.mask {
+                    _ if !is_given => Background::OfNetwork,
+                    Some(_) => Background::Visible,
+                    None => Background::Unknown,
+                };
+                mask_rim::own_colors(&mut rgb, &mask, background, is_hair, is_kept)
             }
             _ => 0,
         };

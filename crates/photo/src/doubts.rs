@@ -156,6 +156,8 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout, swapped: bool) -> Vec<Doubt>
         let Rect { width, height, .. } = one.report.person;
         if width as f32 > WIDEST * height as f32 {
             add(&[one], Sign::Wide { size: [width, height] });
+            // The network knows upright people.
+            continue;
         }
         let Some(joints) = &one.joints else {
             if one.is_asked {

@@ -3,8 +3,8 @@
 use std::fmt;
 
 use glam::Vec2;
-use image::RgbImage;
 use image::imageops::{self, FilterType};
+use image::{GrayImage, RgbImage};
 use serde::Serialize;
 use snapsnap_net::blazepose::{Pose, SIDE};
 
@@ -20,6 +20,8 @@ const AROUND: [f32; 2] = [1.05, 1.2];
 const LOOKS: usize = 3;
 /// Largest change of the box's edges after which no further look is needed, as a share of the square's side.
 const STEADY: f32 = 0.05;
+/// Brightness of the background of pictures with a mask.
+const GREY: f32 = 150.0;
 /// Probability above which there is a person, a joint, or a person's pixel.
 const LIKELY: f32 = 0.5;
 
@@ -71,9 +73,15 @@ impl Look {
         Some(last)
     }
 
-    /// Looks at the person in a box of a picture.
-    pub fn at(picture: &RgbImage, person: Rect, network: &FindPose) -> Option<Self> {
-        let small = Small::new(picture);
+    /// Looks at the person in a box of a picture whose mask is known, before grey.
+    pub fn at(picture: &RgbImage, mask: &GrayImage, person: Rect, network: &FindPose) -> Option<Self> {
+        let mut small = Small::new(picture);
+        let (width, height) = small.picture.dimensions();
+        let mask = imageops::thumbnail(mask, width, height);
+        for (pixel, share) in small.picture.pixels_mut().zip(mask.pixels()) {
+            let share = super::unit(share[0]);
+            pixel.0 = pixel.0.map(|v| (share * f32::from(v) + (1.0 - share) * GREY).round() as u8);
+        }
         let corner = Vec2::new(person.x as f32, person.y as f32);
         let size = Vec2::new(person.width as f32, person.height as f32);
         small.look([corner, corner + size].map(|edge| edge / small.scale), AROUND[1], network)
@@ -421,7 +429,8 @@ mod tests {
                 let whole = Rect { x: 0, y: 0, width, height };
                 let probabilities = look.probabilities(whole, [5, 7]);
                 assert!(probabilities.iter().all(|p| *p == 1.0), "{width}×{height}: {probabilities:?}");
-                assert!(Look::at(&picture, whole, &answer(1.0, place)).is_some());
+                let mask = GrayImage::new(width, height);
+                assert!(Look::at(&picture, &mask, whole, &answer(1.0, place)).is_some());
                 let _ = (look.joints.facing(), look.joints.outside([width, height]), look.joints.sits());
             }
         }

@@ -41,14 +41,25 @@ const WIDER: u32 = 2;
 /// Share of the background from which a pixel among hair is mixed.
 const STRANDS: f32 = 0.2;
 
+/// What the pixels outside of a mask are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Background {
+    /// The photograph's, and a network made the mask.
+    OfNetwork,
+    /// The photograph's, unless they have exactly one colour, as in a cut-out.
+    Visible,
+    /// Anything: they are transparent.
+    Unknown,
+}
+
 /// Pixels whose colours mix person and background get the colours behind them: pixels beside the outline, down to a
-/// depth that is measured and returned (in pixels), pixels of the background in a network's mask (`is_cut_out`), and
+/// depth that is measured and returned (in pixels), pixels of the background in a network's mask, and
 /// pixels among hair. `is_hair` and `is_kept` say whether there may be hair at a column and row, and whether a user
 /// keeps the pixel.
 pub(super) fn own_colors(
     rgb: &mut RgbImage,
     mask: &GrayImage,
-    is_cut_out: bool,
+    background: Background,
     is_hair: impl Fn(Vec2) -> bool,
     is_kept: impl Fn(u32, u32) -> bool,
 ) -> usize {
@@ -58,8 +69,8 @@ pub(super) fn own_colors(
     let Some(rim) = Rim::new(mask, person, (WIDER * reach as u32) as i8) else { return 0 };
     let mut colors = Colors::new(&rim, rgb);
     let assumed = (ASSUMED * scale).round().clamp(1.0, reach);
-    // Beside a given mask, one colour may be none, as in a cut-out.
-    let is_known = is_cut_out || !colors.is_flat;
+    let is_cut_out = background == Background::OfNetwork;
+    let is_known = is_cut_out || background == Background::Visible && !colors.is_flat;
     let width = if is_known { colors.mixed(&rim, reach).unwrap_or(assumed) } else { assumed };
     // Whether a pixel shows the background, without a gap from the outline; and whether it is mixed.
     let mut shown = vec![false; rim.pixels.len()];
@@ -412,8 +423,8 @@ mod tests {
         assert!((rgb, mask) == same, "{what}");
     }
 
-    type Background = fn(u32, u32) -> Vec3;
-    const BACKGROUNDS: [(&str, Background); 4] = [
+    type Behind = fn(u32, u32) -> Vec3;
+    const BACKGROUNDS: [(&str, Behind); 4] = [
         ("white", |_, _| Vec3::ONE),
         ("grey", |_, _| Vec3::splat(0.5)),
         ("black", |_, _| Vec3::ZERO),
@@ -450,7 +461,7 @@ mod tests {
                 let taken =
                     if sigma > 0.0 { blurred(picture(background), sigma) } else { picture(background) };
                 let mut rgb = taken.clone();
-                let width = own_colors(&mut rgb, &mask(0.0), true, |_| false, |_, _| false);
+                let width = own_colors(&mut rgb, &mask(0.0), Background::OfNetwork, |_| false, |_, _| false);
                 let (before, after) = (error(&taken, &mask(0.0)), error(&rgb, &mask(0.0)));
                 println!("{name}, σ {sigma}: {width} pixels, error {before} → {after}");
                 // The person's fine pattern is a tenth.
@@ -478,7 +489,7 @@ mod tests {
             |rgb: &RgbImage| rgb.enumerate_pixels().filter(|(x, y, p)| white(*x, *y) && p[2] > 220).count();
         let with = |is_hair: bool| {
             let mut rgb = taken.clone();
-            own_colors(&mut rgb, &mask(0.0), true, |_| is_hair, |_, _| false);
+            own_colors(&mut rgb, &mask(0.0), Background::OfNetwork, |_| is_hair, |_, _| false);
             bright(&rgb)
         };
         let all = bright(&taken);
@@ -489,7 +500,7 @@ mod tests {
             with(true)
         );
         let (mut rgb, grown) = (picture(BACKGROUNDS[0].1), mask(5.0));
-        own_colors(&mut rgb, &grown, true, |_| false, |_, _| false);
+        own_colors(&mut rgb, &grown, Background::OfNetwork, |_| false, |_, _| false);
         let left = rgb
             .enumerate_pixels()
             .filter(|(x, y, p)| grown.get_pixel(*x, *y)[0] >= INSIDE && p[2] > 240)
