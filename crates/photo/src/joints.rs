@@ -248,7 +248,7 @@ pub struct Joints(pub Vec<Joint>);
 
 /// Least distance of the shoulders in front and back views, and largest one in side views, as shares of the torso's
 /// length (docs/notes/photographs.md, "Joints").
-const SHOULDERS: [f32; 2] = [0.5, 0.4];
+const SHOULDERS: [f32; 2] = [0.5, 0.25];
 /// Least angle of the torso to the vertical of somebody who does not stand, in degrees.
 const LEANING: f32 = 45.0;
 /// Largest drop from hip to knee of somebody who sits, as a share of the torso's length. Who stands has 0.61 or more.
@@ -388,7 +388,7 @@ mod tests {
         let front = standing();
         let back = changed(&front, |_, at| Vec2::new(100.0 - at.x, at.y));
         assert_eq!((front.facing(), back.facing()), (Some(Facing::Front), Some(Facing::Back)));
-        let thin = |x: f32| 50.0 + 0.3 * (x - 50.0);
+        let thin = |x: f32| 50.0 + 0.2 * (x - 50.0);
         assert_eq!(changed(&front, |_, at| Vec2::new(thin(at.x), at.y)).facing(), Some(Facing::Side));
         // Upside down and lying people keep their side.
         let (turned, lying) =
