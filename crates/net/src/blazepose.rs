@@ -56,10 +56,10 @@ pub struct BlazePose {
 /// What the network sees in a square picture.
 #[derive(Debug, Clone)]
 pub struct Pose {
-    /// 33 joints, and six points that describe where the body is: column and row in pixels of the input, depth in the same unit (negative towards the camera), and the logits of
-    /// visible and of present. 0 nose, 7 and 8 ears, 11 and 12 shoulders, 13 and 14 elbows, 15 and 16 wrists,
-    /// 17 to 22 hands, 23 and 24 hips, 25 and 26 knees, 27 and 28 ankles, 29 and 30 heels, 31 and 32 toes. Odd
-    /// numbers are on the person's left.
+    /// 33 joints, and six points that describe where the body is: column and row in pixels of the input, depth in the
+    /// same unit (negative towards the camera), and the logits of visible and of present. 0 nose, 7 and
+    /// 8 ears, 11 and 12 shoulders, 13 and 14 elbows, 15 and 16 wrists, 17 to 22 hands, 23 and 24 hips, 25 and 26 knees,
+    /// 27 and 28 ankles, 29 and 30 heels, 31 and 32 toes. Odd numbers are on the person's left.
     pub landmarks: Vec<[f32; 5]>,
     /// Probability that the picture shows a person.
     pub presence: f32,

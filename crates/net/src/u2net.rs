@@ -147,7 +147,7 @@ fn rectified(layer: &Conv2d, x: Tensor<4>) -> Tensor<4> {
     relu(layers::conv2d(layer, x, false))
 }
 
-/// Reads a convolution with as many rows and columns out as in (of odd kernels). A kernel with one input is a depthwise one.
+/// Reads a convolution. Odd kernels keep the size. A kernel with one input is a depthwise one.
 pub(crate) fn convolution(
     source: &Source,
     name: &str,

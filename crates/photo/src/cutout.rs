@@ -10,9 +10,10 @@ use snapsnap_mesh::picture::{self, MAX_BYTES};
 use snapsnap_net::Photograph;
 
 use crate::exif_camera::{Frame, Shot};
-use crate::joints::{Joints, Look};
-use crate::mask_rim::Background;
+use crate::joints::Sight;
+use crate::look::Look;
 use crate::matting::{Matte, matte};
+use crate::mixed_colors::{self, Background};
 use crate::placing::{Mapping, Standing, on_canvas, placed, placed_as_demo};
 use crate::recentring::Turn;
 use crate::rect::Rect;
@@ -33,11 +34,8 @@ pub(super) struct Cutout<'a> {
     pub mask: GrayImage,
     pub frame: Frame,
     pub report: PhotoReport,
-    /// The person's joints in the photograph before it is turned; `None` if the pose network sees nobody, or was not
-    /// asked.
-    pub joints: Option<Joints>,
-    /// Whether the pose network was asked.
-    pub is_asked: bool,
+    /// What the pose network sees.
+    pub sight: Sight,
 }
 
 impl<'a> Cutout<'a> {
@@ -108,14 +106,17 @@ impl<'a> Cutout<'a> {
             return Err(FileError::unsuitable(path, message));
         }
         // Training samples need no joints.
-        let is_asked = is_file || !is_given;
         if is_given && is_file {
             look = Look::at(&rgb, &mask, person, &pose);
         }
-        let joints = look.map(|look| look.joints);
+        let sight = match look {
+            Some(look) => Sight::Person(look.joints),
+            None if is_given && !is_file => Sight::Unasked,
+            None => Sight::Nobody,
+        };
         let mixed = match placement {
             Placement::Training { .. } => {
-                let is_hair = |place| joints.as_ref().is_some_and(|joints| joints.is_hair(place));
+                let is_hair = |place| sight.joints().is_some_and(|joints| joints.is_hair(place));
                 let size = rgb.dimensions().into();
                 let is_kept = |x, y| strokes.is_some_and(|strokes| mask_strokes::keeps(strokes, size, x, y));
                 let background = match source.mask {
@@ -123,7 +124,7 @@ impl<'a> Cutout<'a> {
                     Some(_) => Background::Visible,
                     None => Background::Unknown,
                 };
-                mask_rim::own_colors(&mut rgb, &mask, background, is_hair, is_kept)
+                mixed_colors::replace(&mut rgb, &mask, background, is_hair, is_kept)
             }
             _ => 0,
         };
@@ -140,7 +141,7 @@ impl<'a> Cutout<'a> {
         };
         let shot = if is_file { Shot::of(&source) } else { Shot::default() };
         let frame = Frame { shot, size: rgb.dimensions().into(), mapping: Mapping::AS_IT_IS };
-        Ok(Self { path, mask_path, rgb, mask, frame, report, joints, is_asked })
+        Ok(Self { path, mask_path, rgb, mask, frame, report, sight })
     }
 
     /// Turns the photograph towards the middle of the person's box, or of the common box of both photographs. Returns

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::INSIDE;
 use super::cutout::Cutout;
-use crate::joints::{Facing, Joints, Part};
+use crate::joints::{Facing, Joints, Part, Sight};
 use crate::rect::Rect;
 
 /// Share of a border from which the mask counts as touching the border.
@@ -134,11 +134,8 @@ fn list(parts: &[Part]) -> String {
 
 /// Whether the first photograph shows the back and the second one the front.
 pub(super) fn are_swapped(front: &Cutout, back: &Cutout) -> bool {
+    let facing = |one: &Cutout| one.sight.joints().and_then(Joints::facing);
     (facing(front), facing(back)) == (Some(Facing::Back), Some(Facing::Front))
-}
-
-fn facing(one: &Cutout) -> Option<Facing> {
-    one.joints.as_ref().and_then(Joints::facing)
 }
 
 /// The doubts about both photographs.
@@ -159,11 +156,13 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout, swapped: bool) -> Vec<Doubt>
             // The network knows upright people.
             continue;
         }
-        let Some(joints) = &one.joints else {
-            if one.is_asked {
+        let joints = match &one.sight {
+            Sight::Unasked => continue,
+            Sight::Nobody => {
                 add(&[one], Sign::Nobody);
+                continue;
             }
-            continue;
+            Sight::Person(joints) => joints,
         };
         let parts = joints.outside(one.frame.size);
         let signs = [
@@ -184,7 +183,7 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout, swapped: bool) -> Vec<Doubt>
             // In the order in which they were given.
             add(&[back, front], Sign::Swapped);
         }
-        if let (Some(a), Some(b)) = (&front.joints, &back.joints) {
+        if let (Some(a), Some(b)) = (front.sight.joints(), back.sight.joints()) {
             match (a.facing(), b.facing()) {
                 (Some(Facing::Front), Some(Facing::Back)) => {
                     let parts = a.moved(b);

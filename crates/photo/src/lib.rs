@@ -5,9 +5,11 @@ mod doubts;
 mod exif_camera;
 mod exposure;
 mod joints;
+mod look;
 mod mask_rim;
 mod mask_strokes;
 mod matting;
+mod mixed_colors;
 mod person;
 mod placing;
 mod plane_map;
@@ -16,6 +18,7 @@ mod rect;
 mod report;
 mod resize;
 mod restoration;
+mod rim;
 mod segmenter;
 mod source;
 mod specks;
@@ -62,9 +65,9 @@ pub struct Photographs {
 }
 
 /// Reads photographs and places each on a canvas of `side` pixels. `cutting` says where the mask of a source without
-/// one comes from. With
-/// [`Placement::Training`], files are exchanged if the first shows the back and the second the front. With [`Placement::Training`], two photographs whose sizes and boxes agree count as taken from one
-/// place and get the same scale and offset. If a focal length is known, from the files or as `focal` (millimetres of
+/// one comes from. With [`Placement::Training`], two photographs whose sizes and boxes agree count as taken from one
+/// place and get the same scale and offset, and two files are exchanged if the first shows the back and the second the
+/// front. If a focal length is known, from the files or as `focal` (millimetres of
 /// 35 mm film), a photograph whose person is beside the middle is turned towards the person.
 ///
 /// # Errors

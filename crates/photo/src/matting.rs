@@ -7,7 +7,7 @@ use image::{GrayImage, Luma, RgbImage};
 use snapsnap_base::bilinear::taps;
 use snapsnap_net::u2net::SIDE;
 
-use super::joints::{FindPose, Look};
+use super::look::{FindPose, Look};
 use super::specks::{Pieces, pieces};
 use super::unit_color;
 use crate::mask_strokes::paint;
