@@ -23,8 +23,9 @@ pub mod weights;
 mod window;
 
 pub use hull::dilated;
+pub use network::pixel_width;
 pub use photograph::Photograph;
 pub use points::Points;
 pub use predict::Prediction;
-pub use reconstruct::{Reconstruction, Reconstructor, placed};
+pub use reconstruct::{Reconstruction, Reconstructor, placed, rows};
 pub use window::Window;

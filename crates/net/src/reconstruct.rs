@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
+use snapsnap_ops::gather::taken;
 use snapsnap_splat::{Camera, Gaussians, RigidTransform};
 
 use crate::config::{Config, RotationFrame, WorldFrame};
@@ -52,6 +53,31 @@ impl Reconstruction {
             },
         };
         placed(config, self.gaussians.clone(), &camera_to_world)
+    }
+
+    /// Leaves Gaussians out that hang off the person's surface. `is_on` says of each whether it is on the surface.
+    pub fn drop_off_surface(&mut self, is_on: &[bool]) {
+        for (origin, _) in self.origins.iter().zip(is_on).filter(|(_, is_on)| !**is_on) {
+            if let Some(view) = origin.view {
+                self.valid[view as usize][origin.pixel as usize] = false;
+            }
+        }
+        let keep: Vec<i32> = (0..is_on.len()).filter(|row| is_on[*row]).map(|row| row as i32).collect();
+        self.gaussians = rows(&self.gaussians, &keep);
+        self.origins = keep.iter().map(|row| self.origins[*row as usize]).collect();
+        self.steps.push(Step::OffSurface { gaussians: is_on.len() - keep.len() });
+    }
+}
+
+/// Some of the Gaussians, by their numbers.
+pub fn rows(of: &Gaussians, rows: &[i32]) -> Gaussians {
+    let pick = |tensor: &Tensor<2>| taken(tensor.clone(), rows);
+    Gaussians {
+        means: pick(&of.means),
+        rotations: pick(&of.rotations),
+        scales: pick(&of.scales),
+        opacities: pick(&of.opacities.clone().unsqueeze_dim(1)).squeeze_dim(1),
+        colors: pick(&of.colors),
     }
 }
 

@@ -93,6 +93,11 @@ pub enum Step {
         /// Their number.
         gaussians: usize,
     },
+    /// Gaussians left out, since they hang off the person's surface.
+    OffSurface {
+        /// Their number.
+        gaussians: usize,
+    },
     /// Several pairs of photographs were reconstructed. The other steps belong to the first pair.
     Pairs {
         /// Their number.
@@ -146,6 +151,9 @@ impl fmt::Display for Step {
                 write!(f, "closed top: {gaussians} Gaussians between the upper edges of front and back")
             }
             Self::Gaussians { gaussians } => write!(f, "{gaussians} Gaussians"),
+            Self::OffSurface { gaussians } => {
+                write!(f, "{gaussians} Gaussians left out: they hang off the person's surface")
+            }
             Self::GaussiansNotFinite { gaussians } => {
                 write!(f, "{gaussians} Gaussians left out: their attributes are not finite")
             }

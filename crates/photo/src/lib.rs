@@ -22,6 +22,7 @@ mod rim;
 mod segmenter;
 mod source;
 mod specks;
+mod surface;
 #[cfg(test)]
 mod tests;
 
@@ -45,6 +46,7 @@ pub use rect::Rect;
 pub use report::{Canvas, PhotoReport, Place};
 pub use restoration::{AXIS, Restoration, nominal, turn_to_front, turned};
 pub use source::{Content, Cutting, Placement, Source};
+pub use surface::reconstruct;
 
 /// Mask value from which a pixel is the person's.
 const INSIDE: u8 = 128;

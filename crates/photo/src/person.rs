@@ -15,6 +15,7 @@ use crate::Photographs;
 use crate::exif_camera::{ELEVATIONS, Frame, Viewpoint};
 use crate::restoration::Restoration;
 use crate::source::Placement;
+use crate::surface::reconstruct;
 
 /// Plausible distances of a camera from a standing person, in metres.
 pub const DISTANCES: RangeInclusive<f64> = 1.0..=30.0;
@@ -222,7 +223,7 @@ pub fn person(
 ) -> Result<Person, NoGaussian> {
     let [front, back] = &*photographs.canvases else { panic!("a person needs two photographs") };
     let config = networks.config();
-    let made = networks.reconstruct([front, back], stage);
+    let made = reconstruct(networks, [front, back], stage);
     if made.gaussians.is_empty() {
         return Err(NoGaussian { steps: made.steps });
     }

@@ -10,8 +10,7 @@ use snapsnap_net::network::View;
 use snapsnap_net::painter::Origin;
 use snapsnap_net::steps::Step;
 use snapsnap_net::weights::{WeightFile, WeightsError};
-use snapsnap_net::{Photograph, Reconstructor, placed};
-use snapsnap_ops::gather::taken;
+use snapsnap_net::{Photograph, Reconstructor, placed, rows};
 use snapsnap_ops::host;
 use snapsnap_photo::{Cutting, Frame, Person, Photographs, Restoration, Source as Picture, Told};
 use snapsnap_splat::Gaussians;
@@ -176,7 +175,11 @@ impl Model {
             let second = (first + 1) % inputs.len();
             let camera = &item.cameras[inputs[first]];
             self.check_pair(degrees(&item.cameras[inputs[second]], camera))?;
-            let made = self.reconstructor.reconstruct([&photographs[first], &photographs[second]], &|_| ());
+            let made = snapsnap_photo::reconstruct(
+                &self.reconstructor,
+                [&photographs[first], &photographs[second]],
+                &|_| (),
+            );
             let mut to_world = camera.world_to_camera.inverse();
             // With several pairs, the second photograph is the first photograph of the next pair.
             let (mut gaussians, origins) = self.thinned(made.gaussians.clone(), &made.origins, count > 1);
@@ -246,15 +249,8 @@ impl Model {
         };
         let keep: Vec<i32> = (0..origins.len()).filter(is_kept).map(|row| row as i32).collect();
         let kept = keep.iter().map(|row| origins[*row as usize]).collect();
-        let rows = |of: Tensor<2>| taken(of, &keep);
-        let gaussians = Gaussians {
-            means: rows(gaussians.means),
-            rotations: rows(gaussians.rotations),
-            scales: rows(gaussians.scales) * stride as f64,
-            opacities: rows(gaussians.opacities.unsqueeze_dim(1)).squeeze_dim(1),
-            colors: rows(gaussians.colors),
-        };
-        (gaussians, kept)
+        let gaussians = rows(&gaussians, &keep);
+        (Gaussians { scales: gaussians.scales * stride as f64, ..gaussians }, kept)
     }
 }
 

@@ -18,6 +18,10 @@ pub struct Grid {
     pub values: Vec<f32>,
 }
 
+/// Cubes along the longest side of the body's box, unless the field would have more corners than [`MAX_CORNERS`].
+const CUBES: f32 = 320.0;
+/// Most corners of the field. A person with level arms has eight million; a cube-shaped scene gets larger cubes.
+const MAX_CORNERS: f32 = 12e6;
 /// Offsets to half of the corners that share an edge with a corner. The other offsets have the opposite sign. Every
 /// cube consists of six tetrahedra around its diagonal (Kuhn's subdivision).
 pub const STEPS: [[usize; 3]; 7] =
@@ -62,6 +66,16 @@ impl Pieces {
 }
 
 impl Grid {
+    /// The grid, still without values, of a box of this size around the origin, with a border of some cubes that stays
+    /// outside.
+    pub fn around(size: Vec3, border: f32) -> Self {
+        let roomy = (size.element_product() / MAX_CORNERS).cbrt();
+        let cell = (size.max_element() / CUBES).max(roomy);
+        let margin = cell * border;
+        let counts = ((size + 2.0 * margin) / cell).ceil().as_usizevec3() + 1;
+        Self { origin: -0.5 * size - margin, cell, counts, values: Vec::new() }
+    }
+
     /// Coordinates of a corner in the grid.
     pub fn at(&self, row: usize) -> USizeVec3 {
         let USizeVec3 { x: nx, y: ny, .. } = self.counts;
@@ -71,6 +85,30 @@ impl Grid {
     /// Position of a corner.
     pub fn place(&self, row: usize) -> Vec3 {
         self.origin + self.cell * self.at(row).as_vec3()
+    }
+
+    /// The corner nearest to a place, unless it is nearer than `border` cubes to the grid's border.
+    pub fn nearest(&self, place: Vec3, border: usize) -> Option<usize> {
+        let at = ((place - self.origin) / self.cell).round();
+        let (low, high) = (Vec3::splat(border as f32), (self.counts - 1 - border).as_vec3());
+        let USizeVec3 { x, y, z } = at.as_usizevec3();
+        (at.cmpge(low) & at.cmple(high)).all().then(|| (z * self.counts.y + y) * self.counts.x + x)
+    }
+
+    /// The corners up to `reach` along each axis from a corner that is not nearer to the border, itself included.
+    pub fn around_corner(&self, row: usize, reach: usize) -> impl Iterator<Item = usize> + use<> {
+        let [_, line, sheet] = self.strides();
+        let first = row - reach * (1 + line + sheet);
+        let side = 0..=2 * reach;
+        let lines = side.clone().flat_map(move |z| side.clone().map(move |y| first + z * sheet + y * line));
+        lines.flat_map(move |line| line..=line + 2 * reach)
+    }
+
+    /// Whether a corner that is not on the border has a neighbour of the other sign.
+    pub fn is_at_surface(&self, row: usize) -> bool {
+        let inside = |row: usize| self.values[row] < 0.0;
+        let mut around = self.strides().into_iter().flat_map(|step| [row - step, row + step]);
+        around.any(|next| inside(next) != inside(row))
     }
 
     pub fn strides(&self) -> [usize; 3] {
@@ -173,18 +211,15 @@ impl Grid {
 
     /// Replaces each value by a weighted mean with its six neighbours. Values on the border stay.
     pub fn smooth(&mut self) {
-        let strides = self.strides();
-        let old = std::mem::take(&mut self.values);
-        self.values = (0..old.len())
-            .into_par_iter()
-            .map(|row| {
-                if self.on_border(row) {
-                    return old[row];
-                }
-                let around = strides.iter().map(|step| old[row - step] + old[row + step]).sum::<f32>();
-                (2.0 * old[row] + around) / 8.0
-            })
-            .collect();
+        let smoothed = |row| if self.on_border(row) { self.values[row] } else { self.smoothed(row) };
+        self.values = (0..self.values.len()).into_par_iter().map(smoothed).collect();
+    }
+
+    /// The weighted mean of the values at a corner and its six neighbours. The corner is not on the border.
+    pub fn smoothed(&self, row: usize) -> f32 {
+        let values = &self.values;
+        let around = self.strides().map(|step| values[row - step] + values[row + step]);
+        (2.0 * values[row] + around.iter().sum::<f32>()) / 8.0
     }
 
     /// Marching tetrahedra: the closed surface between inside and outside. Each edge has two triangles. Triangles are

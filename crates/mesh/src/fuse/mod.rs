@@ -8,6 +8,7 @@ mod grid;
 mod manifold;
 mod parts;
 mod simplify;
+mod stray;
 mod tunnels;
 mod views;
 
@@ -27,10 +28,8 @@ use color::Mean;
 use grid::{Grid, Kept};
 use views::{View, host};
 
-/// Cubes along the longest side of the body's box, unless the field would have more corners than [`MAX_CORNERS`].
-const CUBES: f32 = 320.0;
-/// Most corners of the field. A person with level arms has eight million; a cube-shaped scene gets larger cubes.
-const MAX_CORNERS: f32 = 12e6;
+pub use stray::on_body;
+
 /// Side in pixels of the pictures for distances.
 const SIDE: u32 = 640;
 /// Side in pixels of the pictures for a texture. Only one of these pictures is in memory at a time.
@@ -46,6 +45,8 @@ const FREE_VIEWS: u8 = 3;
 const OPAQUE: f32 = 0.1;
 /// Share of the Gaussians at either end of each axis that the body's box leaves out, since some lie far from the body.
 const FLYING: f32 = 0.002;
+/// Space around the body's box, as a share of its longest side. The Gaussians that were left out may belong to a hand.
+const MARGIN: f32 = 0.06;
 /// Extent of a Gaussian around its centre, in standard deviations.
 const SEEN: f32 = 2.0;
 /// Number of smoothing passes, against steps between views and the graininess of Gaussians.
@@ -139,15 +140,12 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     let (centre, size) = body(&scene.gaussians)?;
     // The surface is computed around the origin, where f32 is finest.
     let scene = centred(scene, centre);
-    let roomy = (size.element_product() / MAX_CORNERS).cbrt();
-    let cell = (size.max_element() / CUBES).max(roomy);
-    // The border stays outside.
-    let margin = cell * (TRUNCATION + 2.0);
-    let counts = ((size + 2.0 * margin) / cell).ceil().as_usizevec3() + 1;
+    let mut grid = Grid::around(size, TRUNCATION + 2.0);
+    let Grid { cell, counts, .. } = grid;
 
     stage("views from all around");
     let radius = f64::from(0.5 * size.length());
-    let cameras = views::cameras(radius, SIDE).into_iter();
+    let cameras = views::cameras(&views::RINGS, radius, SIDE).into_iter();
     let most = if options.force { u64::MAX } else { MAX_INTERSECTIONS };
     let views: Result<Vec<View>, SplatError> =
         cameras.map(|camera| View::new(&scene, camera, radius, most)).collect();
@@ -162,9 +160,8 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     views::distrust_inner_sides(&mut views, THICKNESS * cell);
 
     stage("distance field");
-    let mut grid = Grid { origin: -0.5 * size - margin, cell, counts, values: Vec::new() };
-    let rows = (0..counts.y * counts.z).into_par_iter();
-    grid.values = rows.flat_map_iter(|row| distances(&grid, row * counts.x, &views)).collect();
+    let line = |row: usize| distances(&grid, &Vec::from_iter(row * counts.x..(row + 1) * counts.x), &views);
+    grid.values = (0..counts.y * counts.z).into_par_iter().flat_map_iter(line).collect();
     (0..SMOOTHED).for_each(|_| grid.smooth());
     // A surface has about twice as many triangles as positions.
     let faces = 2 * grid.crossings();
@@ -213,7 +210,7 @@ fn centred(scene: &Loaded, centre: Vec3) -> Loaded {
 fn textured(mesh: &mut Mesh, scene: &Loaded, radius: f64, side: usize, cell: f32) -> Result<(), FuseError> {
     let atlas = atlas::atlas(mesh, side).map_err(FuseError::Texture)?;
     let mut means = vec![Mean::default(); atlas.texels.len()];
-    for camera in views::cameras(radius, TEXTURE_SIDE) {
+    for camera in views::cameras(&views::RINGS, radius, TEXTURE_SIDE) {
         let view = View::new(scene, camera, radius, u64::MAX)?;
         means.par_iter_mut().zip(&atlas.texels).for_each(|(mean, texel)| {
             mean.add(&view, texel.place, texel.normal, color::REACH * cell);
@@ -276,21 +273,19 @@ impl Distance {
     }
 }
 
-/// Distances of the row of corners along x that begins with `first`.
-fn distances(grid: &Grid, first: usize, views: &[View]) -> impl Iterator<Item = f32> {
+/// Distances of some corners, which should be neighbours: view by view they are neighbours in a picture, too, and in the
+/// cache.
+fn distances(grid: &Grid, corners: &[usize], views: &[View]) -> Vec<f32> {
     let reach = TRUNCATION * grid.cell;
-    let start = grid.place(first);
-    let mut distances = vec![Distance::default(); grid.counts.x];
-    // View by view: neighbours on a row are neighbours in a picture and in the cache.
+    let mut found: Vec<_> = corners.iter().map(|row| (grid.place(*row), Distance::default())).collect();
     for view in views {
-        for (x, distance) in distances.iter_mut().enumerate() {
-            let place = Vec3 { x: start.x + grid.cell * x as f32, ..start };
-            if let Some(surface) = view.surface(place) {
+        for (place, distance) in &mut found {
+            if let Some(surface) = view.surface(*place) {
                 distance.add(surface, reach);
             }
         }
     }
-    distances.into_iter().map(move |distance| distance.finish(reach))
+    found.into_iter().map(|(_, distance)| distance.finish(reach)).collect()
 }
 
 /// Centre and size of the box of the body's Gaussians, metres.
@@ -308,10 +303,9 @@ fn body(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
         return Err(FuseError::Nothing(FEWEST));
     }
     let mut along = vec![0.0; there.len()];
-    let skipped = along.len() - 1 - (FLYING * along.len() as f32) as usize;
     let mut end = |place: &dyn Fn(&(Vec3, f32)) -> f32| {
         along.iter_mut().zip(&there).for_each(|(along, row)| *along = place(row));
-        f64::from(*along.select_nth_unstable_by(skipped, f32::total_cmp).1)
+        f64::from(upper_end(&mut along))
     };
     let (mut low, mut high, mut centres) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
     for axis in 0..3 {
@@ -323,8 +317,7 @@ fn body(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
     if centres.max_element() < f64::from(RESOLVED) * size {
         return Err(FuseError::Coarse);
     }
-    // The Gaussians that were left out may belong to a hand.
-    let margin = 0.06 * size;
+    let margin = f64::from(MARGIN) * size;
     let (low, high) = (low - margin, high + margin);
     let (centre, size) = ((0.5 * (low + high)).as_vec3(), (high - low).as_vec3());
     let (length, distance) = (size.max_element(), centre.length());
@@ -333,4 +326,10 @@ fn body(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
     } else {
         Err(FuseError::Foreign { length, distance })
     }
+}
+
+/// The largest value but for [`FLYING`] of all. There is one at least.
+fn upper_end(values: &mut [f32]) -> f32 {
+    let skipped = values.len() - 1 - (FLYING * values.len() as f32) as usize;
+    *values.select_nth_unstable_by(skipped, f32::total_cmp).1
 }

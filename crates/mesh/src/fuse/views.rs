@@ -7,10 +7,12 @@ use snapsnap_splat::scene::Loaded;
 use snapsnap_splat::{Camera, Orbit, RenderOptions, RigidTransform, SplatError, render};
 
 /// Rings of cameras around the subject: downward pitch in degrees, and number of cameras.
-const RINGS: [(f64, usize); 7] =
+pub const RINGS: [(f64, usize); 7] =
     [(-85.0, 1), (-55.0, 6), (-25.0, 10), (5.0, 16), (35.0, 10), (65.0, 6), (88.0, 1)];
 /// Distance of the cameras from the centre of a ball, in radii: perspective hides little, and f32 suffices for depths.
 const DISTANCE: f64 = 4.0;
+/// Share of a picture's width that the ball fills.
+pub const FILLED: f64 = 0.98;
 /// Least coverage of a pixel that shows a surface.
 pub const COVERED: f32 = 0.5;
 /// Least cosine between a surface's normal and the ray. Pixels of more oblique surfaces mix several surfaces.
@@ -35,19 +37,20 @@ pub struct View {
     color: Vec<Vec3>,
 }
 
-/// Cameras around a ball at the origin. Each picture of `side`² pixels shows the whole ball.
-pub fn cameras(radius: f64, side: u32) -> Vec<Camera> {
+/// Cameras on rings around a ball at the origin. Each picture of `side`² pixels shows the whole ball.
+pub fn cameras(rings: &[(f64, usize)], radius: f64, side: u32) -> Vec<Camera> {
     let distance = DISTANCE * radius;
-    let focal = (distance * distance / (radius * radius) - 1.0).sqrt() * 0.5 * 0.98;
+    let focal = (distance * distance / (radius * radius) - 1.0).sqrt() * 0.5 * FILLED;
     let orbit = Orbit { centre: DVec3::ZERO, radius: distance, focal, ..Orbit::default() };
-    let ring = |(row, (pitch_degrees, count)): (usize, (f64, usize))| {
+    let ring = |(row, (pitch_degrees, count)): (usize, &(f64, usize))| {
+        let (pitch_degrees, count) = (*pitch_degrees, *count);
         (0..count).map(move |i| {
             let yaw_degrees = 360.0 * (i as f64 + 0.5 * (row % 2) as f64) / count as f64;
             let camera = Orbit { yaw_degrees, pitch_degrees, ..orbit }.camera(side);
             Camera { principal_point: DVec2::splat(0.5 * f64::from(side)), ..camera }
         })
     };
-    RINGS.into_iter().enumerate().flat_map(ring).collect()
+    rings.iter().enumerate().flat_map(ring).collect()
 }
 
 impl View {
@@ -71,22 +74,50 @@ impl View {
             depth.iter().zip(&alpha).map(|(z, a)| if *a > COVERED { z / a } else { 0.0 }).collect();
         let color = color.as_chunks::<3>().0.iter().zip(&alpha);
         let color = color.map(|(c, a)| Vec3::from_array(*c) / a.max(COVERED)).collect();
+        let mut view = Self::of_depth(camera, depth);
+        view.color = color;
+        Ok(view)
+    }
+
+    /// The depths of points, each of which covers a square of 2·`reach` + 1 pixels. There are no colours.
+    pub fn of_points(points: &[Vec3], camera: Camera, reach: usize) -> Self {
+        let mut view = Self::of_depth(camera, Vec::new());
+        let side = view.camera.width as usize;
+        let mut depth = vec![f32::INFINITY; side * side];
+        for (pixel, z) in points.iter().filter_map(|place| view.pixel(*place)) {
+            let (x, y) = (pixel % side, pixel / side);
+            for row in y.saturating_sub(reach)..(y + reach + 1).min(side) {
+                for depth in &mut depth[row * side..][x.saturating_sub(reach)..(x + reach + 1).min(side)] {
+                    *depth = depth.min(z);
+                }
+            }
+        }
+        view.depth = depth.into_iter().map(|z| if z < f32::INFINITY { z } else { 0.0 }).collect();
+        view.facing = view.cosines();
+        view
+    }
+
+    fn of_depth(camera: Camera, depth: Vec<f32>) -> Self {
         let mut view = Self {
             centre: camera.centre().as_vec3(),
             projection: projection(&camera),
-            facing: vec![0.0; depth.len()],
+            facing: Vec::new(),
             camera,
             depth,
-            color,
+            color: Vec::new(),
         };
-        view.facing = (0..view.depth.len())
-            .map(|pixel| {
-                let Some((place, normal)) = view.patch(pixel) else { return 0.0 };
-                let cosine = -normal.dot(place.normalize_or_zero());
-                if cosine < FLATTEST { 0.0 } else { cosine }
-            })
-            .collect();
-        Ok(view)
+        view.facing = view.cosines();
+        view
+    }
+
+    /// The cosine of every pixel between normal and ray; see [`Self::facing`].
+    fn cosines(&self) -> Vec<f32> {
+        let cosine = |pixel| {
+            let Some((place, normal)) = self.patch(pixel) else { return 0.0 };
+            let cosine = -normal.dot(place.normalize_or_zero());
+            if cosine < FLATTEST { 0.0 } else { cosine }
+        };
+        (0..self.depth.len()).map(cosine).collect()
     }
 
     /// Position and normal (towards the camera) of the surface in a pixel, metres in the camera's frame. `None` at
@@ -134,9 +165,13 @@ impl View {
 
     /// Colour and cosine of the surface at a point, if the surface is within `reach` metres of the point.
     pub fn color(&self, place: Vec3, reach: f32) -> Option<(Vec3, f32)> {
+        self.shown(place, reach).map(|pixel| (self.color[pixel], self.facing[pixel]))
+    }
+
+    /// The pixel that shows a point of the surface, within `reach` metres.
+    fn shown(&self, place: Vec3, reach: f32) -> Option<usize> {
         let (pixel, z) = self.pixel(place)?;
-        let (depth, facing) = (self.depth[pixel], self.facing[pixel]);
-        (facing > 0.0 && (depth - z).abs() < reach).then(|| (self.color[pixel], facing))
+        (self.facing[pixel] > 0.0 && (self.depth[pixel] - z).abs() < reach).then_some(pixel)
     }
 
     /// Unit vector from the camera to a point.
@@ -167,7 +202,7 @@ pub fn distrust_inner_sides(views: &mut [View], reach: f32) {
         let (place, normal) = (view.centre + to_world * place, to_world * normal);
         let (mut this, mut other) = (0.0, 0.0);
         for from in views.iter() {
-            if from.color(place, reach).is_some() {
+            if from.shown(place, reach).is_some() {
                 let cosine = -normal.dot(from.towards(place));
                 *(if cosine > 0.0 { &mut this } else { &mut other }) += cosine.abs();
             }

@@ -23,7 +23,8 @@ pub use dust3r::TokenMaps;
 pub use input::Input;
 pub use predictor::{Decoded, Encoded, PointMap, PointPredictor, activate};
 pub use rays::anchors;
-pub(crate) use rays::{nominal_camera, pixel_width};
+pub(crate) use rays::nominal_camera;
+pub use rays::pixel_width;
 pub use unet::Levels;
 pub use view::View;
 

@@ -33,7 +33,7 @@ pub(crate) fn nominal_camera(view: View, pair_degrees: f64, side: usize) -> Came
 }
 
 /// Width in metres of a pixel of the nominal cameras at the person's distance, on a canvas of `side`² pixels.
-pub(crate) fn pixel_width(side: usize) -> f32 {
+pub fn pixel_width(side: usize) -> f32 {
     let nominal = Camera::orbit_at_yaw_degrees(0.0, side as u32);
     ((nominal.centre() * DVec3::new(1.0, 0.0, 1.0)).length() / nominal.focal.x) as f32
 }
