@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use image::{DynamicImage, GrayImage, Luma, RgbaImage};
+use image::{DynamicImage, GrayImage, Luma, RgbaImage, imageops};
 use snapsnap_tests::sample::{picture, reconstruct};
 use snapsnap_tests::{refused, root, snapsnap, succeed};
 
@@ -62,7 +62,7 @@ fn one_picture_in_place_of_two_is_noticed_and_taken() {
     let twice = [front.clone(), front.clone()];
     assert!(strict(temporary.path(), &twice, &[]).contains("the same picture twice"));
     let flipped = temporary.path().join("flipped.png");
-    image::imageops::flip_horizontal(&picture("front")).save(&flipped).expect("written");
+    imageops::flip_horizontal(&picture("front")).save(&flipped).expect("written");
     assert!(strict(temporary.path(), &[front, flipped], &[]).contains("mirror image"));
     let output = reconstruct(temporary.path(), &twice).output().expect("runs");
     let said = String::from_utf8_lossy(&output.stderr);
@@ -153,7 +153,7 @@ fn joints_tell_what_is_wrong() {
     let said = strict(temporary.path(), &[side, back.clone()], &[]);
     assert!(said.contains("270.png: the person is seen from the side"), "{said}");
     let other = temporary.path().join("other.png");
-    image::imageops::resize(&picture("front"), 700, 800, image::imageops::FilterType::Triangle)
+    imageops::resize(&picture("front"), 700, 800, imageops::FilterType::Triangle)
         .save(&other)
         .expect("written");
     let said = strict(temporary.path(), &[front.clone(), other], &[]);
@@ -165,7 +165,7 @@ fn joints_tell_what_is_wrong() {
         mask.enumerate_pixels().filter(|(.., share)| share[0] > 127).map(|(_, y, _)| y).collect();
     let (top, height) = (rows[0], rows[rows.len() - 1] - rows[0]);
     let crop = |picture: &mut RgbaImage, y: u32, height: u32| {
-        image::imageops::crop(picture, 0, y, mask.width(), height).to_image()
+        imageops::crop(picture, 0, y, mask.width(), height).to_image()
     };
     for (y, rows, part) in
         [(top + height / 12, height, "head"), (0, top + 8 * height / 10, "left leg, right leg")]
@@ -175,4 +175,31 @@ fn joints_tell_what_is_wrong() {
         let said = strict(temporary.path(), &[path, back.clone()], &[]);
         assert!(said.contains(&format!("outside of the picture: {part}")), "{part}: {said}");
     }
+}
+
+#[test]
+fn somebody_else_in_the_picture_is_noticed() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let beside = |share: f32| {
+        pair(temporary.path(), |picture| {
+            let (width, height) = picture.dimensions();
+            let mut both = RgbaImage::from_pixel(2 * width, height, image::Rgba([120, 130, 125, 255]));
+            imageops::overlay(&mut both, &picture, 0, 0);
+            let [w, h] = [width, height].map(|side| (share * side as f32) as u32);
+            if w > 0 {
+                let other = imageops::resize(&picture, w, h, imageops::FilterType::Triangle);
+                imageops::overlay(&mut both, &other, width.into(), (height - h).into());
+            }
+            both.pixels_mut().for_each(|pixel| pixel.0[3] = 255);
+            both
+        })
+    };
+    let said = strict(temporary.path(), &beside(0.7), &[]);
+    assert_eq!(said.matches("somebody else").count(), 2, "{said}");
+    let said = succeed(reconstruct(temporary.path(), &beside(0.0)).args([
+        "--strict",
+        "--set",
+        "network.resolution=256",
+    ]));
+    assert!(!said.contains("warning"), "{said}");
 }

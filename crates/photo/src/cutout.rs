@@ -36,6 +36,8 @@ pub(super) struct Cutout<'a> {
     pub report: PhotoReport,
     /// What the pose network sees.
     pub sight: Sight,
+    /// Whether another person is beside the person.
+    pub is_accompanied: bool,
 }
 
 impl<'a> Cutout<'a> {
@@ -87,6 +89,7 @@ impl<'a> Cutout<'a> {
             }
             (Err(message), Cutting::Given) => return Err(FileError::unsuitable(path, message)),
         };
+        let is_accompanied = look.as_ref().is_some_and(|look| look.is_accompanied(&rgb, &pose));
         // The demo includes every pixel that is not 0. Lossy masks have many such pixels outside the person.
         let least = if matches!(placement, Placement::Demo { .. }) { 1 } else { INSIDE };
         // The demo removes neither specks nor rims, and a network's mask has none.
@@ -141,7 +144,7 @@ impl<'a> Cutout<'a> {
         };
         let shot = if is_file { Shot::of(&source) } else { Shot::default() };
         let frame = Frame { shot, size: rgb.dimensions().into(), mapping: Mapping::AS_IT_IS };
-        Ok(Self { path, mask_path, rgb, mask, frame, report, sight })
+        Ok(Self { path, mask_path, rgb, mask, frame, report, sight, is_accompanied })
     }
 
     /// Turns the photograph towards the middle of the person's box, or of the common box of both photographs. Returns

@@ -65,6 +65,8 @@ pub enum Sign {
     FromTheSide,
     /// Nobody is recognised.
     Nobody,
+    /// Others are beside the person.
+    Accompanied,
     /// The person lies.
     Lies,
     /// The person sits.
@@ -109,6 +111,9 @@ impl fmt::Display for Doubt {
             }
             Sign::FromTheSide => write!(f, "the person is seen from the side, not from the front or back"),
             Sign::Nobody => write!(f, "nobody is recognised in the picture"),
+            Sign::Accompanied => {
+                write!(f, "somebody else is in the picture: only one person is taken")
+            }
             Sign::Lies => write!(f, "the person does not stand upright"),
             Sign::Sits => write!(f, "the person seems to sit: the person should stand"),
             Sign::Outside { parts } => {
@@ -166,6 +171,7 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout, swapped: bool) -> Vec<Doubt>
         };
         let parts = joints.outside(one.frame.size);
         let signs = [
+            (one.is_accompanied, Sign::Accompanied),
             (joints.lies(), Sign::Lies),
             (!joints.lies() && joints.sits(), Sign::Sits),
             (!joints.lies() && joints.facing() == Some(Facing::Side), Sign::FromTheSide),

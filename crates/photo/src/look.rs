@@ -18,6 +18,14 @@ const AROUND: [f32; 2] = [1.05, 1.2];
 const LOOKS: usize = 3;
 /// Largest change of the box's edges after which no further look is needed, as a share of the square's side.
 const STEADY: f32 = 0.05;
+/// Probability above which there certainly is a person.
+const CERTAIN: f32 = 0.9;
+/// Least width of the space beside a person in which another person is looked for, as a share of the person's height.
+const BESIDE: f32 = 0.2;
+/// Least width of a picture, as a share of its height, in which several squares are looked at, and most steps between
+/// them.
+const WIDE: f32 = 1.2;
+const MOST_STEPS: f32 = 8.0;
 /// Brightness of the background of pictures with a mask.
 const GREY: f32 = 150.0;
 /// Probability above which there is a person, a joint, or a person's pixel.
@@ -35,6 +43,8 @@ pub struct Look {
     pub joints: Joints,
     /// The box around the person's joints and likely pixels, in pixels of the photograph.
     pub person: [Vec2; 2],
+    /// Probability that there is a person.
+    presence: f32,
     /// Upper left corner and sides of the square that the network saw.
     corner: Vec2,
     side: Vec2,
@@ -46,13 +56,12 @@ impl Look {
     /// Looks for a person in a picture, from near if need be. `None` if there is nobody.
     pub fn find(picture: &RgbImage, network: &FindPose) -> Option<Self> {
         let small = Small::new(picture);
-        let whole = [Vec2::ZERO, small.size()];
-        let mut last = small.look(whole, AROUND[0], network)?;
+        let mut last = match small.largest(network) {
+            Some(look) => look,
+            None => small.look([Vec2::ZERO, small.size()], AROUND[0], network)?,
+        };
         for _ in 1..LOOKS {
-            let Some(next) = small.look(last.person.map(|edge| edge / small.scale), AROUND[1], network)
-            else {
-                break;
-            };
+            let Some(next) = small.look_near(&last, network) else { break };
             let moved = [0, 1].map(|i| (next.person[i] - last.person[i]).abs().max_element());
             last = next;
             if moved[0].max(moved[1]) < STEADY * last.side.max_element() {
@@ -60,6 +69,24 @@ impl Look {
             }
         }
         Some(last)
+    }
+
+    /// Whether another person stands beside this one in the picture.
+    pub fn is_accompanied(&self, picture: &RgbImage, network: &FindPose) -> bool {
+        let [low, high] = self.person.map(Vec2::as_uvec2);
+        let (width, height) = picture.dimensions();
+        let least = BESIDE * (self.person[1] - self.person[0]).y;
+        [[0, low.x], [high.x, width]].into_iter().any(|[left, right]| {
+            let across = right.saturating_sub(left);
+            if across == 0 || (across as f32) < least {
+                return false;
+            }
+            let beside = Small::new(&imageops::crop_imm(picture, left, 0, across, height).to_image());
+            let is_certain = |look: &Self| look.presence > CERTAIN;
+            let whole = beside.look([Vec2::ZERO, beside.size()], AROUND[0], network).filter(is_certain);
+            let near = whole.and_then(|look| beside.look_near(&look, network));
+            near.is_some_and(|look| is_certain(&look))
+        })
     }
 
     /// Looks at the person in a box of a picture whose mask is known, before grey.
@@ -134,6 +161,29 @@ impl Small {
         Vec2::new(self.picture.width() as f32, self.picture.height() as f32)
     }
 
+    /// The largest person of a picture that is wider than high. The network looks for somebody in the middle: between
+    /// two people it sees nobody.
+    fn largest(&self, network: &FindPose) -> Option<Look> {
+        let Vec2 { x: width, y: height } = self.size();
+        if width < WIDE * height {
+            return None;
+        }
+        let steps = (2.0 * width / height).ceil().min(MOST_STEPS);
+        let squares = (0..=steps as usize).map(|step| {
+            let left = (width - height) * step as f32 / steps;
+            [Vec2::new(left, 0.0), Vec2::new(left + height, height)]
+        });
+        let near = |square| self.look_near(&self.look(square, 1.0, network)?, network);
+        let tall = |look: &Look| look.person[1].y - look.person[0].y;
+        let certain = squares.filter_map(near).filter(|look| look.presence > CERTAIN);
+        certain.max_by(|a, b| tall(a).total_cmp(&tall(b)))
+    }
+
+    /// Looks at the person of a look before.
+    fn look_near(&self, before: &Look, network: &FindPose) -> Option<Look> {
+        self.look(before.person.map(|edge| edge / self.scale), AROUND[1], network)
+    }
+
     /// Looks at a square around a box, both in pixels of the reduced picture. The square is black outside.
     fn look(&self, [low, high]: [Vec2; 2], around: f32, network: &FindPose) -> Option<Look> {
         let side = ((around * (high - low).max_element()).ceil() as u32).clamp(1, 2 * LONGEST);
@@ -184,6 +234,7 @@ impl Small {
         Some(Look {
             joints,
             person: person.map(|edge| edge.clamp(Vec2::ZERO, limit)),
+            presence,
             corner: place(0.0, 0.0),
             side: self.scale * side as f32,
             mask,
@@ -212,7 +263,10 @@ mod tests {
                 let look = Look::find(&picture, &answer(1.0, place)).expect("a person");
                 let whole = Rect { x: 0, y: 0, width, height };
                 let probabilities = look.probabilities(whole, [5, 7]);
-                assert!(probabilities.iter().all(|p| *p == 1.0), "{width}×{height}: {probabilities:?}");
+                // Of a wide picture, only the person's square is seen.
+                let least = if width > height { 0.0 } else { 1.0 };
+                let is_right = |p: &f32| (least..=1.0).contains(p);
+                assert!(probabilities.iter().all(is_right), "{width}×{height}: {probabilities:?}");
                 let mask = GrayImage::new(width, height);
                 assert!(Look::at(&picture, &mask, whole, &answer(1.0, place)).is_some());
                 let _ = (look.joints.facing(), look.joints.outside([width, height]), look.joints.sits());

@@ -80,12 +80,14 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
     assert!(found["command"].as_str().is_some_and(|said| said.contains("evaluate --config")));
     // Means over each person's views, then over people, from the table of views.
     let table = fs::read_to_string(report.join("views.csv")).expect("a table");
-    let mut sums: BTreeMap<[&str; 3], [f64; 3]> = BTreeMap::new();
+    let mut sums: BTreeMap<[&str; 3], [f64; 5]> = BTreeMap::new();
     for line in table.lines().skip(1) {
         let cells: Vec<&str> = line.split(',').collect();
         let sum = sums.entry([cells[0], cells[1], cells[2]]).or_default();
         let number = |i: usize| cells[i].parse::<f64>().expect("a number");
-        [1.0, number(6), number(7)].iter().zip(sum).for_each(|(v, sum)| *sum += v);
+        let of_side = if (45.0..=135.0).contains(&(number(5) % 180.0)) { 1.0 } else { 0.0 };
+        let values = [1.0, number(6), number(7), of_side * number(6), of_side];
+        values.iter().zip(sum).for_each(|(v, sum)| *sum += v);
     }
     let mean = |contestant: &str, protocol: &str, figure: usize| {
         let people = ["0000", "0001"].map(|name| {
@@ -96,10 +98,16 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
         });
         (people[0] + people[1]) / 2.0
     };
+    let sides = |protocol: &str| {
+        let people = ["0000", "0001"].map(|name| sums[&["model", protocol, name]]);
+        (people[0][3] / people[0][4] + people[1][3] / people[1][4]) / 2.0
+    };
     for protocol in ["paper", "masked"] {
         let of = &found["protocols"][protocol];
         assert_eq!((of["people"].as_u64(), of["views"].as_u64()), (Some(2), Some(24)));
         assert_eq!(of["subjects"].as_array().map(Vec::len), Some(2));
+        let of_sides = of["sides_psnr"]["mean"].as_f64().expect("a figure");
+        assert!((of_sides - sides(protocol)).abs() < 1e-9, "{of_sides} {}", sides(protocol));
         assert!(of["overall"]["lpips"].is_null() && of["subjects"][0]["lpips"].is_null());
         for (figure, name) in [(1, "psnr"), (2, "ssim")] {
             let check = |value: &Value, contestant: &str| {

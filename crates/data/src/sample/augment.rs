@@ -96,7 +96,7 @@ impl Augment {
     }
 }
 
-fn compressed(picture: RgbImage, quality: u8) -> RgbImage {
+pub(super) fn compressed(picture: RgbImage, quality: u8) -> RgbImage {
     let mut bytes = Vec::new();
     let done = JpegEncoder::new_with_quality(&mut bytes, quality.clamp(1, 100)).encode_image(&picture);
     let decoded = image::ImageReader::with_format(Cursor::new(&bytes), image::ImageFormat::Jpeg).decode();

@@ -5,6 +5,7 @@ mod four_views;
 mod loader;
 mod photograph_changes;
 mod rectified;
+mod scene;
 mod stage1;
 mod stage2;
 mod test_set;

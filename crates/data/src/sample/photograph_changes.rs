@@ -4,7 +4,9 @@ use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use super::augment::moved;
+use super::scene::{Scene, behind, photographed};
 use snapsnap_base::config::outside;
+use snapsnap_base::random::stream;
 use snapsnap_photo::Rect;
 
 /// Canvas side that lengths refer to.
@@ -36,6 +38,10 @@ pub struct PhotographChanges {
     pub back_exposure: f32,
     /// Colour of the background from 0 to 1; unset: the data set's. The background shows through too large masks.
     pub background: Option<[f32; 3]>,
+    /// What is behind the person instead of a background of one colour.
+    pub scene: Option<Scene>,
+    /// Whether photographs have the faults of a camera: point spread, sharpening, noise and JPEG.
+    pub camera: bool,
     /// Error of the masks in pixels of 1024: above 0 they are too large, below 0 too small.
     pub mask: f32,
     /// Share of the person's width that the frame cuts off, on the left of the first photograph and on the right of the
@@ -55,6 +61,12 @@ impl PhotographChanges {
         {
             return Some((key, "must be 0 with `photographs.road = \"user\"`, which uses no masks".into()));
         }
+        if self.scene.is_some() && self.background.is_some() {
+            return Some((
+                "scene",
+                "must be unset with `photographs.background`: it is behind the person".into(),
+            ));
+        }
         let background = self.background.unwrap_or_default().map(|value| ("background", value, 0.0..=1.0));
         outside([
             ("exposure", self.exposure, -4.0..=4.0),
@@ -65,9 +77,10 @@ impl PhotographChanges {
         .or_else(|| outside(background))
     }
 
-    /// The changed photograph number `index` of a person, and its mask.
+    /// The changed photograph number `index` of the person `name`, and its mask.
     pub(super) fn apply(
         &self,
+        name: &str,
         index: usize,
         mut color: RgbImage,
         mut mask: GrayImage,
@@ -80,12 +93,20 @@ impl PhotographChanges {
             let gain = stops.exp2();
             color.iter_mut().for_each(|v| *v = (f32::from(*v) * gain).round().min(255.0) as u8);
         }
-        if let Some(background) = self.background {
-            for (pixel, share) in color.pixels_mut().zip(mask.pixels()) {
-                let share = f32::from(share.0[0]) / 255.0;
-                let mixed = |c: usize| share * f32::from(pixel.0[c]) + (1.0 - share) * 255.0 * background[c];
+        let mut random = stream(&format!("photograph/{name}/{index}"));
+        let plain = self.background.map(|background| background.map(|v| 255.0 * v));
+        let scene = self.scene.map(|scene| behind(scene, &color, &mask, &mut random));
+        if plain.is_some() || scene.is_some() {
+            for (x, y, pixel) in color.enumerate_pixels_mut() {
+                let share = f32::from(mask.get_pixel(x, y).0[0]) / 255.0;
+                let other = scene.as_ref().map(|scene| scene.get_pixel(x, y).0.map(f32::from));
+                let other = other.or(plain).expect("one of them is there");
+                let mixed = |c: usize| share * f32::from(pixel.0[c]) + (1.0 - share) * other[c];
                 pixel.0 = [0, 1, 2].map(|c| mixed(c).round() as u8);
             }
+        }
+        if self.camera {
+            color = photographed(&color, &mut random);
         }
         let reach = self.mask * mask.width() as f32 / REFERENCE_SIDE;
         if reach != 0.0 {
@@ -134,7 +155,7 @@ mod tests {
             ..PhotographChanges::default()
         };
         assert_eq!(changes.problem(), None);
-        let (mixed, grown) = changes.apply(0, color, mask);
+        let (mixed, grown) = changes.apply("person", 0, color, mask);
         let pixels: Vec<[u8; 3]> = mixed.pixels().take(3).map(|pixel| pixel.0).collect();
         // A fifth of the second pixel is the person's.
         assert_eq!(pixels, [[100, 0, 40], [20, 204, 110], [0, 255, 128]]);
@@ -150,6 +171,8 @@ mod tests {
         let key = |changes: PhotographChanges| changes.problem().expect("refused").0;
         assert_eq!(key(PhotographChanges { mask: 3.0, ..user }), "mask");
         assert_eq!(key(PhotographChanges { cut: 0.1, ..user }), "cut");
+        let both = PhotographChanges { scene: Some(Scene::Wall), background: Some([1.0; 3]), ..user };
+        assert_eq!(key(both), "scene");
     }
 
     #[test]
@@ -159,7 +182,7 @@ mod tests {
         });
         let mask = GrayImage::from_fn(4, 1, |x, _| Luma([if x < 2 { 255 } else { 0 }]));
         let grey = PhotographChanges { grey: true, ..PhotographChanges::default() };
-        let (flat, same) = grey.apply(0, color, mask.clone());
+        let (flat, same) = grey.apply("person", 0, color, mask.clone());
         assert_eq!(same, mask);
         assert!(flat.pixels().all(|pixel| pixel.0 == [150, 0, 60]), "{flat:?}");
     }

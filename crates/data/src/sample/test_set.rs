@@ -66,7 +66,7 @@ impl Test {
         let description = self.0.folder.description();
         let photograph = |(place, view): (usize, &usize)| {
             let (color, mask) = person.picture(*view, false)?;
-            Ok(changes.apply(place, color, mask))
+            Ok(changes.apply(person.name, place, color, mask))
         };
         let photographs = views.iter().enumerate().map(photograph).collect::<Result<Vec<_>, FileError>>()?;
         let camera = |view: usize| person.camera(view).map(|stored| self.0.camera(&stored));

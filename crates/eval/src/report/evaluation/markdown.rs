@@ -21,7 +21,7 @@ impl Evaluation<'_> {
         let people = self.outcome.people.len();
         let _ = writeln!(
             text,
-            "* {people} people; {}; intervals: 95 %, bootstrap over people; SSIM and LPIPS × 100\n",
+            "* {people} people; {}; intervals: 95 %, bootstrap over people; SSIM and LPIPS × 100; sides: the views from 45° to 135°\n",
             self.outcome.pictures
         );
         self.alignment_markdown(&mut text);
@@ -29,9 +29,10 @@ impl Evaluation<'_> {
             let row = |judged: &Judged| {
                 let people = by_person(&judged.rows, i);
                 let counts = [people.len().to_string(), judged.rows.len().to_string()];
-                scores(&judged.name, counts, &Self::overall(&people))
+                let sides = cell(Self::sides(judged, i), 1.0, 2);
+                [scores(&judged.name, counts, &Self::overall(&people)), vec![sides]].concat()
             };
-            let header = [&["", "people", "views"][..], &TITLES].concat();
+            let header = [&["", "people", "views"][..], &TITLES, &["PSNR of the sides, dB"]].concat();
             let table = table_markdown(&header, self.outcome.judged.iter().map(row));
             let _ = writeln!(text, "## Protocol `{}`\n\n{table}", protocol.name());
             let others = self.outcome.judged.iter().filter(|judged| judged.kind != Kind::Model);

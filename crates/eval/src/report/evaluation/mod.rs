@@ -3,6 +3,7 @@
 mod markdown;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -19,6 +20,9 @@ use crate::statistics::{Interval, difference, interval, mean, quantile_of_times}
 type Figure = (&'static str, fn(&Score) -> Option<f64>, f64, usize);
 const FIGURES: [Figure; 3] =
     [("psnr", |s| Some(s.psnr), 1.0, 2), ("ssim", |s| s.ssim, 100.0, 2), ("lpips", |s| s.lpips, 100.0, 2)];
+
+/// Angles between the axis through front and back and the views that show the sides, in degrees.
+const SIDES: RangeInclusive<f64> = 45.0..=135.0;
 
 /// The content of a report.
 pub struct Evaluation<'a> {
@@ -50,6 +54,14 @@ impl Evaluation<'_> {
             let values: Option<Vec<f64>> = people.values().map(of).collect();
             interval(&values?)
         })
+    }
+
+    /// The interval of the PSNR of views from the sides, dB, over people.
+    fn sides(judged: &Judged, protocol: usize) -> Option<Interval> {
+        // Half a degree for views at the ends of the range.
+        let is_side = |row: &&Row| SIDES.contains(&(row.degrees % 180.0).round());
+        let people = by_person(judged.rows.iter().filter(is_side), protocol);
+        interval(&people.values().map(|score| score.psnr).collect::<Vec<_>>())
     }
 
     /// Figures of `one` minus figures of `other`, person by person, over the views that both have.
@@ -90,7 +102,11 @@ impl Evaluation<'_> {
             None => json!({}),
         };
         let plain = |judged: &Judged| {
-            self.by_protocol(|protocol| figures(&Self::overall(&by_person(&judged.rows, protocol))))
+            self.by_protocol(|protocol| {
+                let mut value = figures(&Self::overall(&by_person(&judged.rows, protocol)));
+                value["sides_psnr"] = json!(Self::sides(judged, protocol));
+                value
+            })
         };
         let named = |kind: Kind, value: &dyn Fn(&Judged) -> Value| -> Value {
             self.of_kind(kind).map(|judged| (judged.name.clone(), value(judged))).collect()
@@ -148,6 +164,7 @@ impl Evaluation<'_> {
         };
         json!({
             "overall": figures(&Self::overall(&people)),
+            "sides_psnr": Self::sides(model, protocol),
             "people": people.len(),
             "views": model.rows.len(),
             "subjects": people.iter().map(subject).collect::<Vec<_>>(),
