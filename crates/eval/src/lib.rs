@@ -4,6 +4,7 @@
 pub mod bench;
 mod error;
 pub mod evaluate;
+pub mod foreign;
 pub mod geometry;
 pub mod lpips;
 pub mod pictures;

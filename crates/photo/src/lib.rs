@@ -26,6 +26,8 @@ mod surface;
 #[cfg(test)]
 mod tests;
 
+use std::panic::resume_unwind;
+
 use glam::Vec3;
 use image::{GrayImage, Rgb, RgbImage};
 use snapsnap_base::FileError;
@@ -82,8 +84,18 @@ pub fn read(
     placement: Placement,
     focal: Option<f64>,
 ) -> Result<Photographs, FileError> {
-    let cutouts = sources.iter().map(|source| Cutout::read(*source, cutting, side, placement));
-    let mut cutouts = cutouts.collect::<Result<Vec<_>, _>>()?;
+    let cut_out = |source| Cutout::read(source, cutting, side, placement);
+    // Threads of their own: a thread of the pool must not wait for the pool.
+    let cutouts = if rayon::current_thread_index().is_none() {
+        std::thread::scope(|scope| {
+            let threads: Vec<_> =
+                sources.iter().map(|source| scope.spawn(move || cut_out(*source))).collect();
+            threads.into_iter().map(|thread| thread.join().unwrap_or_else(|e| resume_unwind(e))).collect()
+        })
+    } else {
+        sources.iter().map(|source| cut_out(*source)).collect::<Vec<_>>()
+    };
+    let mut cutouts = cutouts.into_iter().collect::<Result<Vec<_>, _>>()?;
     // One camera took all photographs: a value that one file lacks is taken from another file.
     let pitch = cutouts.iter().find_map(|cutout| cutout.frame.shot.pitch);
     let lens = cutouts.iter().find_map(|cutout| cutout.frame.shot.focal);

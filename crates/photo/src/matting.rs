@@ -1,7 +1,7 @@
 //! Removes backgrounds (docs/method.md, "Background removal"): two networks find the person, a guided filter aligns
 //! edges with the photograph's (He et al., "Guided Image Filtering", 2013; He and Sun, "Fast Guided Filter", 2015).
 
-use glam::{Mat3, Vec2, Vec3};
+use glam::{DMat3, Mat3, Vec2, Vec3};
 use image::imageops::{self, FilterType};
 use image::{GrayImage, Luma, RgbImage};
 use snapsnap_base::bilinear::taps;
@@ -32,13 +32,15 @@ const JUDGED: (f32, f32) = (0.1, 0.9);
 const COMPARED: f32 = 8.0;
 /// Difference of the other network's mean probabilities for person and surroundings from which it begins to count, and
 /// from which it decides alone.
-const TOLD_APART: (f32, f32) = (0.5, 0.8);
+const TOLD_APART: (f32, f32) = (0.6, 0.9);
 /// Longest side of a cut-out. Larger pictures are reduced first, two of one size alike. Canvases have 1024 rows.
-const LONGEST: u32 = 4096;
+const LONGEST: u32 = 2048;
 /// Longer side of the pictures on which filters are computed.
 const FILTERED: u32 = 640;
 /// Radius of the filters, in pixels.
 const RADIUS: usize = 4;
+/// Number of filters, each of the result of the filter before.
+const FILTERS: usize = 3;
 /// Variance below which the photograph has no edges.
 const EPSILON: f32 = 1e-4;
 /// Up to the first coverage, a mask's pixel is background, from the second on, person: filtered edges are soft.
@@ -96,7 +98,7 @@ pub fn matte(
         let scale = size[0] as f32 / part.height as f32 / look.scale();
         probability = combined(&probability, &look.probabilities(part, size), size[1], scale);
     }
-    Filter::new(&person, probability, size).cut_out(&picture, &mut mask, part);
+    Filter::new(&person, &probability, size).cut_out(&picture, &mut mask, part);
     if let Some(strokes) = strokes {
         paint(strokes, &mut mask);
     }
@@ -183,33 +185,44 @@ struct Filter {
 
 impl Filter {
     /// `p`: probabilities at `size` (rows, columns).
-    fn new(rgb: &RgbImage, p: Vec<f32>, size: [usize; 2]) -> Self {
+    fn new(rgb: &RgbImage, p: &[f32], size: [usize; 2]) -> Self {
         let wide = size[1];
         let small = imageops::resize(rgb, wide as u32, size[0] as u32, FilterType::Triangle);
         let color: Vec<Vec3> = small.pixels().map(unit_color).collect();
 
         let mean = |of: &dyn Fn(usize) -> f32| means(&(0..p.len()).map(of).collect::<Vec<_>>(), wide, RADIUS);
         let mean_of_color: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| color[i][c]));
-        let mean_of_p = mean(&|i| p[i]);
-        let mean_of_both: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| color[i][c] * p[i]));
         let products = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)];
         let products = products.map(|(a, b)| mean(&|i| color[i][a] * color[i][b]));
-        let line = |i: usize| {
-            let at = |planes: &[Vec<f32>; 3]| Vec3::from_array(std::array::from_fn(|c| planes[c][i]));
-            let m = at(&mean_of_color);
+        let at = |planes: &[Vec<f32>; 3], i: usize| Vec3::from_array(std::array::from_fn(|c| planes[c][i]));
+        // In f64: the three colours of a grey edge are nearly one.
+        let inverse = |i: usize| {
+            let m = at(&mean_of_color, i);
             let [rr, rg, rb, gg, gb, bb] = std::array::from_fn(|k| products[k][i]);
-            // In f64: the three colours of a grey edge are nearly one.
             let covariance = Mat3::from_cols(
                 Vec3::new(rr + EPSILON, rg, rb) - m * m.x,
                 Vec3::new(rg, gg + EPSILON, gb) - m * m.y,
                 Vec3::new(rb, gb, bb + EPSILON) - m * m.z,
             );
-            let both = (at(&mean_of_both) - m * mean_of_p[i]).as_dvec3();
-            let slope = (covariance.as_dmat3().inverse() * both).as_vec3();
-            (slope, mean_of_p[i] - slope.dot(m))
+            covariance.as_dmat3().inverse()
         };
-        let (slope, offset): (Vec<Vec3>, Vec<f32>) = (0..p.len()).map(line).unzip();
-        let (slope, offset) = (mean_colors(&slope, wide), means(&offset, wide, RADIUS));
+        let inverses: Vec<DMat3> = (0..p.len()).map(inverse).collect();
+        let fitted = |p: &[f32]| {
+            let mean_of_p = mean(&|i| p[i]);
+            let mean_of_both: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| color[i][c] * p[i]));
+            let line = |i: usize| {
+                let m = at(&mean_of_color, i);
+                let slope = (inverses[i] * (at(&mean_of_both, i) - m * mean_of_p[i]).as_dvec3()).as_vec3();
+                (slope, mean_of_p[i] - slope.dot(m))
+            };
+            let (slope, offset): (Vec<Vec3>, Vec<f32>) = (0..p.len()).map(line).unzip();
+            (mean_colors(&slope, wide), means(&offset, wide, RADIUS))
+        };
+        let (mut slope, mut offset) = fitted(p);
+        for _ in 1..FILTERS {
+            let share = |i: usize| between(slope[i].dot(color[i]) + offset[i], SOFT);
+            (slope, offset) = fitted(&(0..p.len()).map(share).collect::<Vec<_>>());
+        }
         Self { size, slope, offset }
     }
 
@@ -340,13 +353,13 @@ mod tests {
     fn large_pictures_are_reduced_and_nobody_is_nobody() {
         // 3600 × 4800 pixels.
         let (rgb, mask) = cut(photograph(12), &network, &pose).expect("a person");
-        assert_eq!((rgb.dimensions(), mask.dimensions()), ((3072, 4096), (3072, 4096)));
+        assert_eq!((rgb.dimensions(), mask.dimensions()), ((1536, 2048), (1536, 2048)));
         let rows = mask.rows().filter(|row| row.clone().any(|value| value[0] > 127)).count() as f32;
-        assert!((rows / 4096.0 - 0.75).abs() < 0.01, "{rows}");
+        assert!((rows / 2048.0 - 0.75).abs() < 0.01, "{rows}");
         let line = RgbImage::from_fn(2, 70_000, |_, y| {
             Rgb(if (9_000..60_000).contains(&y) { PERSON } else { WALL })
         });
-        assert_eq!(cut(line, &network, &nobody).expect("a person").1.dimensions(), (1, 4096));
+        assert_eq!(cut(line, &network, &nobody).expect("a person").1.dimensions(), (1, 2048));
         assert!(cut(RgbImage::from_pixel(90, 80, Rgb(WALL)), &network, &nobody).is_none());
         assert!(cut(RgbImage::new(1, 1), &|_| vec![0.0; SIDE * SIDE], &nobody).is_none());
         // Everything is the person.

@@ -58,7 +58,7 @@ pub struct Arguments {
     #[arg(long, value_name = "auto|network|none", default_value = "auto", value_parser = ["auto", "network", "none"])]
     pub cutout: String,
     /// Also write the photographs without background, before they are placed on the canvas, as front.png and back.png.
-    /// The back's colours are matched to the front's. They are at most 4096 pixels long if the network removed the
+    /// The back's colours are matched to the front's. They are at most 2048 pixels long if the network removed the
     /// background.
     #[arg(long, value_name = "DIR")]
     save_cutouts: Option<PathBuf>,

@@ -52,6 +52,11 @@ pub struct PhotographChanges {
 }
 
 impl PhotographChanges {
+    /// Whether the photographs get another background.
+    pub fn has_background(&self) -> bool {
+        self.scene.is_some() || self.background.is_some()
+    }
+
     /// The first invalid key, and why it is invalid.
     pub fn problem(&self) -> Option<(&'static str, String)> {
         // Photographs of a user come without masks, and only masks say where the frame cuts the person off.

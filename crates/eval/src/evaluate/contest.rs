@@ -15,6 +15,7 @@ use super::shared::rendered;
 use super::sides::side_points;
 use super::surface::Truth;
 use crate::EvalError;
+use crate::foreign::Palette;
 use crate::geometry::{ALIGNED, Align, double, icp, opaque_centres, thinned};
 use crate::pictures::Picture;
 use crate::points::{Pair, PointError, point_errors};
@@ -54,6 +55,10 @@ pub struct Shown {
     pub points: Result<Vec<PointError>, String>,
     /// Number of pixels and Gaussians that were not finite.
     pub lost: usize,
+    /// Mean overlap of the cut-outs and the true masks, if the networks cut the person out.
+    pub masks: Option<f64>,
+    /// Colours of photographs with a background of their own.
+    pub palette: Option<Palette>,
     /// Time of the reconstruction.
     pub time: Option<Duration>,
     /// Rotation in degrees, shift of the middle in cm and scale of the alignment, if there was one.
@@ -90,7 +95,15 @@ impl Contestant {
         canvas: usize,
         (metrics, truth): (&MetricsSection, Option<&Truth>),
     ) -> Result<Shown, EvalError> {
-        let of = |gaussians| Shown { gaussians, points: Ok(Vec::new()), lost: 0, time: None, aligned: None };
+        let of = |gaussians| Shown {
+            gaussians,
+            points: Ok(Vec::new()),
+            lost: 0,
+            masks: None,
+            palette: None,
+            time: None,
+            aligned: None,
+        };
         let plain = |gaussians: Gaussians| {
             if gaussians.is_empty() { Err(no_gaussian()) } else { Ok(of(Some(gaussians))) }
         };
@@ -110,9 +123,12 @@ impl Contestant {
                 // Pictures can be compared without errors of points.
                 let points = errors(people, row, item, inputs, &made.maps, model.side());
                 let points = points.map_err(|e| e.to_string());
+                let has_background = model.photographs.has_background();
                 Ok(Shown {
                     points,
                     lost: made.lost,
+                    masks: made.masks,
+                    palette: has_background.then(|| Palette::new(&item.photographs)),
                     time: Some(made.time),
                     aligned,
                     ..plain(made.gaussians)?

@@ -19,6 +19,7 @@ use snapsnap_data::sample::{PhotographChanges, TestItem};
 use snapsnap_splat::Gaussians;
 
 use crate::EvalError;
+use crate::foreign::{Palette, Traces};
 use crate::geometry::Align;
 use crate::lpips::Lpips;
 use crate::pictures::Picture;
@@ -48,6 +49,8 @@ pub struct Row {
     pub degrees: f64,
     /// In the order of the config's protocols.
     pub scores: Vec<Score>,
+    /// What the photographs' background left, if the photographs have one.
+    pub traces: Option<Traces>,
 }
 
 /// All measurements of a contestant.
@@ -65,6 +68,8 @@ pub struct Judged {
     pub surface: Vec<(usize, Surface)>,
     /// The mesh made of the Gaussians, per person and turn.
     pub mesh: Vec<(usize, Surface)>,
+    /// Mean overlap of the cut-outs and the true masks, per person and turn.
+    pub masks: Vec<(usize, f64)>,
     /// From the photographs to the Gaussians, per person and turn.
     pub times: Vec<Duration>,
     /// Number of Gaussians, per person and turn.
@@ -161,8 +166,8 @@ struct Place<'a> {
     person: usize,
 }
 
-/// A contestant's index, and its scores by protocol.
-type Scored = (usize, Result<Vec<Score>, EvalError>);
+/// A contestant's index, and its scores by protocol with the traces of the background.
+type Scored = (usize, Result<(Vec<Score>, Option<Traces>), EvalError>);
 
 impl Place<'_> {
     /// Records a failure; `what` follows the person's name.
@@ -214,8 +219,8 @@ impl Place<'_> {
             let scored = self.kept(outcome, &format!(", view {view}"), found);
             for (i, scores) in scored.unwrap_or_default() {
                 let what = format!(", {}, view {view}", contestants[i].name());
-                if let Some(scores) = self.kept(outcome, &what, scores) {
-                    outcome.judged[i].rows.push(Row { person, turn, view, degrees, scores });
+                if let Some((scores, traces)) = self.kept(outcome, &what, scores) {
+                    outcome.judged[i].rows.push(Row { person, turn, view, degrees, scores, traces });
                 }
             }
         }
@@ -232,6 +237,7 @@ impl Place<'_> {
         }
         let judged = &mut outcome.judged[i];
         judged.points.extend(points.into_iter().flatten());
+        judged.masks.extend(made.masks.map(|overlap| (person, overlap)));
         judged.times.extend(made.time);
         judged.gaussians.extend(made.gaussians.as_ref().map(Gaussians::len));
         judged.aligned.extend(made.aligned);
@@ -258,16 +264,25 @@ impl Place<'_> {
         let Self { config, people, .. } = *self;
         let side = people.side(&config.views);
         let (target, mask) = people.target(self.row, view, side)?;
+        let masked = || Region::masked(&mask, [side, side], margin(side));
         let region = |protocol: &Protocol| match protocol {
             Protocol::Paper => Region::paper(&target),
-            Protocol::Masked => Region::masked(&mask, [side, side], margin(side)),
+            Protocol::Masked => masked(),
         };
         let regions = config.metrics.protocols.iter().map(region).collect::<Result<Vec<_>, _>>()?;
         let scores = |(i, shown): (usize, &Option<Shown>)| {
             let camera = &item.cameras[view];
-            let image = self.contestants[i].picture(shown.as_ref()?, camera, view, side, &config.views);
+            let shown = shown.as_ref()?;
             let score = |image: &Picture, region| Score::new(image, &target, region, self.lpips);
-            Some((i, image.and_then(|image| regions.iter().map(|region| score(&image, region)).collect())))
+            let judged = || {
+                let image = self.contestants[i].picture(shown, camera, view, side, &config.views)?;
+                let scores = regions.iter().map(|region| score(&image, region)).collect::<Result<_, _>>()?;
+                let traces = |palette: &Palette| {
+                    masked().map(|region| palette.traces(&image, &target, &mask, &region))
+                };
+                Ok((scores, shown.palette.as_ref().map(traces).transpose()?))
+            };
+            Some((i, judged()))
         };
         Ok(shown.iter().enumerate().filter_map(scores).collect())
     }

@@ -17,7 +17,9 @@ use snapsnap_splat::Gaussians;
 
 use super::person::{degrees, photograph};
 use crate::EvalError;
+use crate::foreign::overlap;
 use crate::geometry::procrustes;
+use crate::statistics::mean;
 use crate::variant::Variant;
 
 /// The networks of a variant on a device.
@@ -38,6 +40,8 @@ pub struct Made {
     pub maps: Vec<(usize, Vec<f32>)>,
     /// Number of pixels and Gaussians that were not finite and are left out.
     pub lost: usize,
+    /// Mean overlap of the cut-outs and the true masks, if the networks cut the person out.
+    pub masks: Option<f64>,
     /// From the photographs on their canvas to the Gaussians.
     pub time: Duration,
     /// Times of the modules, over all pairs of photographs.
@@ -135,6 +139,8 @@ impl Model {
         }
         self.check_pair(degrees(&item.cameras[back], &item.cameras[front]))?;
         let photographs = self.canvases(item, Cutting::All)?;
+        let pairs = photographs.cutouts.iter().zip(&item.photographs);
+        let overlaps: Vec<f64> = pairs.map(|((_, found), (_, truth))| overlap(found, truth)).collect();
         let start = Instant::now();
         let person = snapsnap_photo::person(&photographs, &self.reconstructor, &Told::default(), &|_| ());
         let Person { gaussians, made, .. } = person.map_err(|none| EvalError::Message(none.to_string()))?;
@@ -152,6 +158,7 @@ impl Model {
             gaussians,
             maps: Vec::new(),
             lost: made.lost,
+            masks: mean(&overlaps),
             time,
             modules: made.times,
             steps: made.steps,
@@ -226,7 +233,7 @@ impl Model {
         if gaussians.is_empty() {
             return Err(no_gaussian());
         }
-        Ok(Made { gaussians, maps, lost, time, modules, steps })
+        Ok(Made { gaussians, maps, lost, masks: None, time, modules, steps })
     }
 
     /// The Gaussians that stride, least opacity and `only_front` (the first photograph's) keep, and their origins.

@@ -91,7 +91,7 @@ pub fn chamfer(a: &[[f32; 3]], b: &[[f32; 3]]) -> Result<Chamfer, EvalError> {
 }
 
 /// For each point of `from`, the row of the nearest point of `to` and its distance.
-fn nearest(from: &[[f32; 3]], to: &[[f32; 3]]) -> Vec<(usize, f64)> {
+pub(crate) fn nearest(from: &[[f32; 3]], to: &[[f32; 3]]) -> Vec<(usize, f64)> {
     let tree = ImmutableKdTree::<f32, 3>::new_from_slice(to).expect("fewer points than u32 can number");
     let found = tree.query_batch(from).nearest_one::<SquaredEuclidean<f32>>().execute();
     let apart = |(p, row): (&[f32; 3], usize)| (row, distance(*p, to[row]));

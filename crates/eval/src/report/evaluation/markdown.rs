@@ -43,6 +43,7 @@ impl Evaluation<'_> {
                 let _ = writeln!(text, "Differences, person by person, from {name}:\n\n{table}");
             }
         }
+        self.photographs_markdown(&mut text);
         for (name, group) in &self.config.groups {
             let row = |(judged, (i, protocol)): (&Judged, (usize, Protocol))| {
                 let people = self.of_group(group, judged, i);
@@ -94,6 +95,28 @@ impl Evaluation<'_> {
             align.description(),
             table_markdown(&["", "degrees", "cm", "scale"], moved.map(row))
         );
+    }
+
+    /// What the photographs' backgrounds left in the people.
+    fn photographs_markdown(&self, text: &mut String) {
+        let found = self.outcome.judged.iter().map(|judged| (judged, Self::photographs(judged)));
+        let rows: Vec<Vec<String>> = found
+            .filter(|(_, shares)| shares.iter().any(Option::is_some))
+            .map(|(judged, [masks, foreign, beside])| {
+                let shares = [foreign, beside].map(|share| cell(share, 100.0, 2));
+                [vec![judged.name.clone(), cell(masks, 1.0, 4)], shares.into()].concat()
+            })
+            .collect();
+        if !rows.is_empty() {
+            let header = ["", "IoU of the masks", "foreign colour, %", "beside the person, %"];
+            let _ = writeln!(
+                text,
+                "## Photographs\n\nIoU of the cut-outs and the true masks. In the views from 45° to 135°, pixels whose colour lies nearer to \
+                 the background's than to the person's, and pixels that show something outside of the grown true mask, as shares of the \
+                 person's pixels.\n\n{}",
+                table_markdown(&header, rows.into_iter())
+            );
+        }
     }
 
     fn geometry_markdown(&self, text: &mut String) {

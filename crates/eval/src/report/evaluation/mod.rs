@@ -12,6 +12,7 @@ use snapsnap_base::plot::{Axes, Series, svg};
 use super::{Header, number, table};
 use crate::evaluate::config::{EvalConfig, Group, Protocol};
 use crate::evaluate::{Judged, Kind, Outcome, Row, Surface, by_person, is_named};
+use crate::foreign::Traces;
 use crate::points::{PointError, VIEWS};
 use crate::score::Score;
 use crate::statistics::{Interval, difference, interval, mean, quantile_of_times};
@@ -58,10 +59,21 @@ impl Evaluation<'_> {
 
     /// The interval of the PSNR of views from the sides, dB, over people.
     fn sides(judged: &Judged, protocol: usize) -> Option<Interval> {
-        // Half a degree for views at the ends of the range.
-        let is_side = |row: &&Row| SIDES.contains(&(row.degrees % 180.0).round());
-        let people = by_person(judged.rows.iter().filter(is_side), protocol);
+        let people = by_person(of_sides(judged), protocol);
         interval(&people.values().map(|score| score.psnr).collect::<Vec<_>>())
+    }
+
+    /// Intervals over people: overlap of masks; shares of foreign colour and beside the person, in views from the sides.
+    fn photographs(judged: &Judged) -> [Option<Interval>; 3] {
+        let traces = |of: fn(&Traces) -> f64| -> Vec<(usize, f64)> {
+            of_sides(judged).filter_map(|row| Some((row.person, of(row.traces.as_ref()?)))).collect()
+        };
+        let over = |values: &[(usize, f64)]| {
+            let mut people: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
+            values.iter().for_each(|(person, value)| people.entry(*person).or_default().push(*value));
+            interval(&people.values().filter_map(|values| mean(values)).collect::<Vec<_>>())
+        };
+        [over(&judged.masks), over(&traces(|traces| traces.foreign)), over(&traces(|traces| traces.beside))]
     }
 
     /// Figures of `one` minus figures of `other`, person by person, over the views that both have.
@@ -121,6 +133,7 @@ impl Evaluation<'_> {
             json!({
                 "protocols": plain(judged),
                 "difference": self.by_protocol(difference),
+                "photographs": photographs_json(judged),
                 "points_mm": points_json(judged),
                 "geometry_cm": geometry_json(&judged.surface),
                 "mesh_cm": geometry_json(&judged.mesh),
@@ -128,6 +141,7 @@ impl Evaluation<'_> {
                 "mean_degrees_cm_scale": alignment_means(judged),
             })
         });
+        report["photographs"] = self.model().map_or(Value::Null, photographs_json);
         report["points_mm"] = self.model().map_or(json!({}), points_json);
         report["alignment"] = json!({
             "method": self.config.metrics.align,
@@ -245,6 +259,16 @@ impl Evaluation<'_> {
             starts.into_iter().flat_map(|from| from..(from + count).min(n)).collect();
         places.into_iter().map(|place| people[place].0).collect()
     }
+}
+
+/// The views from the sides; half a degree for views at the ends of the range.
+fn of_sides(judged: &Judged) -> impl Iterator<Item = &Row> {
+    judged.rows.iter().filter(|row| SIDES.contains(&(row.degrees % 180.0).round()))
+}
+
+fn photographs_json(judged: &Judged) -> Value {
+    let [masks, foreign, beside] = Evaluation::photographs(judged);
+    json!({ "mask_iou": masks, "foreign_share": foreign, "beside_share": beside })
 }
 
 fn figures(intervals: &[Option<Interval>; 3]) -> Value {
