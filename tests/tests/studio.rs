@@ -48,12 +48,17 @@ fn people_of_the_studio_are_those_of_reconstruct() {
     let (status, headers, answer) = server.post("/cutout", "X-Job: 1\r\n", &front);
     assert!(status == 200 && headers.contains("x-parts: "), "{headers}");
     let lengths = headers.lines().find_map(|line| line.strip_prefix("x-parts: ")).expect("lengths");
-    let (picture, mask) = lengths.split_once(',').expect("two");
-    let picture: usize = picture.parse().expect("a length");
-    assert_eq!(picture + mask.parse::<usize>().expect("a length"), answer.len());
+    let lengths: Vec<usize> =
+        lengths.trim().split(',').map(|length| length.parse().expect("a length")).collect();
+    let (pictures, seen) = answer.split_at(lengths[0] + lengths[1]);
+    let (picture, mask) = pictures.split_at(lengths[0]);
+    let seen: Value = serde_json::from_slice(seen).expect("JSON");
+    let shoulders = [11, 12].map(|joint| seen["joints"][joint][0].as_f64().expect("a column"));
+    assert!((0.5..0.7).contains(&shoulders[0]) && (0.3..0.5).contains(&shoulders[1]), "{seen}");
+    assert_eq!(seen["signs"], json!([]));
     let sample_front = image::load_from_memory(&front).expect("a picture").into_rgba8();
-    let shown = image::load_from_memory(&answer[..picture]).expect("a picture").into_rgb8();
-    let mask = image::load_from_memory(&answer[picture..]).expect("a picture").into_luma8();
+    let shown = image::load_from_memory(picture).expect("a picture").into_rgb8();
+    let mask = image::load_from_memory(mask).expect("a picture").into_luma8();
     assert_eq!((shown.dimensions(), mask.dimensions()), ((1024, 1024), (1024, 1024)));
     let off = sample_front.pixels().zip(mask.pixels()).filter(|(own, mask)| own[3].abs_diff(mask[0]) > 1);
     assert!(off.count() < 1000, "the mask is the photograph's own, but for specks and rims");
@@ -314,6 +319,36 @@ mod browser {
         let elsewhere =
             |address: &&String| !["blob:", "data:", own.as_str()].iter().any(|o| address.starts_with(o));
         assert_eq!(page.requests.iter().filter(elsewhere).collect::<Vec<_>>(), Vec::<&String>::new());
+    }
+
+    /// The joints are drawn faintly. Feet beyond the border are said, beside the legs.
+    #[test]
+    fn what_is_wrong_stands_beside_the_limb() {
+        let Some(mut page) = Page::new(1000, 900) else { return };
+        let temporary = tempfile::tempdir().expect("temporary folder");
+        let [whole, _] = photographs(temporary.path());
+        let picture = image::open(&whole).expect("a picture");
+        let cut = temporary.path().join("cut.jpg");
+        picture.crop_imm(0, 0, picture.width(), picture.height() * 3 / 4).save(&cut).expect("written");
+        let server = Server::studio(SIDE);
+        open(&mut page, &server);
+        let mut notes = |file: &Path| {
+            page.value("document.querySelector('[data-side=front] .other').click()");
+            page.choose(&field("front"), file);
+            page.wait(&is_cut("front"));
+            let said = page.value("document.querySelector('[data-side=front] .message').textContent");
+            let colored = page.value(
+                "(() => { const c = document.querySelector('[data-side=front] canvas'); \
+                 const { data } = c.getContext('2d').getImageData(0, 0, c.width, c.height); let n = 0; \
+                 for (let i = 0; i < data.length; i += 4) n += data[i] === 255 && data[i + 1] === 204 && data[i + 2] === 102; \
+                 return n; })()",
+            );
+            (said.as_str().expect("text").to_owned(), colored.as_u64().expect("a number"))
+        };
+        assert_eq!(notes(&whole), (String::new(), 0));
+        let (said, colored) = notes(&cut);
+        assert!(said.starts_with("outside of the picture: left leg, right leg") && colored > 500, "{said} {colored}");
+        assert!(page.errors.is_empty(), "{:?}", page.errors);
     }
 
     /// Two pages make people at once. One of them has no WebGL: it gets the downloads.

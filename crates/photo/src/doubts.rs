@@ -88,41 +88,59 @@ pub enum Sign {
     },
 }
 
+impl Sign {
+    /// What is wrong with parts of the body, and the parts.
+    pub fn of_parts(&self) -> (&'static str, &[Part]) {
+        match self {
+            Self::Outside { parts } => ("outside of the picture", parts),
+            Self::Moved { parts } => ("elsewhere in the back photograph", parts),
+            _ => ("", &[]),
+        }
+    }
+}
+
 impl fmt::Display for Doubt {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: ", self.photographs.join(" and "))?;
-        match &self.sign {
-            Sign::TouchesBorders { borders } => write!(
+        write!(f, "{}: {}", self.photographs.join(" and "), self.sign)
+    }
+}
+
+impl fmt::Display for Sign {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::TouchesBorders { borders } => write!(
                 f,
                 "the mask touches {borders} borders of the picture: is it inverted? The person must be white"
             ),
-            Sign::Wide { size: [width, height] } => write!(
+            Self::Wide { size: [width, height] } => write!(
                 f,
                 "the person is wider than high ({width}×{height} pixels): the person should stand upright"
             ),
-            Sign::Equal => write!(f, "this is the same picture twice"),
-            Sign::Mirrored => write!(f, "one is the mirror image of the other"),
-            Sign::Swapped => {
+            Self::Equal => write!(f, "this is the same picture twice"),
+            Self::Mirrored => write!(f, "one is the mirror image of the other"),
+            Self::Swapped => {
                 write!(f, "the first shows the back, the second the front: they were exchanged")
             }
-            Sign::SameSide { facing } => {
+            Self::SameSide { facing } => {
                 let side = if *facing == Facing::Front { "front" } else { "back" };
                 write!(f, "both show the person's {side}: one must show the front, one the back")
             }
-            Sign::FromTheSide => write!(f, "the person is seen from the side, not from the front or back"),
-            Sign::Nobody => write!(f, "nobody is recognised in the picture"),
-            Sign::Accompanied => {
+            Self::FromTheSide => write!(f, "the person is seen from the side, not from the front or back"),
+            Self::Nobody => write!(f, "nobody is recognised in the picture"),
+            Self::Accompanied => {
                 write!(f, "somebody else is in the picture: only one person is taken")
             }
-            Sign::Lies => write!(f, "the person does not stand upright"),
-            Sign::Sits => write!(f, "the person seems to sit: the person should stand"),
-            Sign::Outside { parts } => {
-                write!(f, "outside of the picture: {}: the whole person must be visible", list(parts))
+            Self::Lies => write!(f, "the person does not stand upright"),
+            Self::Sits => write!(f, "the person seems to sit: the person should stand"),
+            Self::Outside { .. } | Self::Moved { .. } => {
+                let (what, parts) = self.of_parts();
+                let why = match self {
+                    Self::Moved { .. } => "both need one pose",
+                    _ => "the whole person must be visible",
+                };
+                write!(f, "{what}: {}: {why}", list(parts))
             }
-            Sign::Moved { parts } => {
-                write!(f, "elsewhere in the back photograph: {}: both need one pose", list(parts))
-            }
-            Sign::LittleOverlap { overlap } => {
+            Self::LittleOverlap { overlap } => {
                 let share = (100.0 * *overlap).round();
                 write!(
                     f,
@@ -143,6 +161,39 @@ pub(super) fn are_swapped(front: &Cutout, back: &Cutout) -> bool {
     (facing(front), facing(back)) == (Some(Facing::Back), Some(Facing::Front))
 }
 
+/// What is wrong with one photograph.
+pub(super) fn signs(one: &Cutout) -> Vec<Sign> {
+    let borders = borders(&one.mask);
+    let mut signs = Vec::new();
+    if borders >= BORDERS {
+        signs.push(Sign::TouchesBorders { borders });
+    }
+    let Rect { width, height, .. } = one.report.person;
+    if width as f32 > WIDEST * height as f32 {
+        // The network knows upright people.
+        signs.push(Sign::Wide { size: [width, height] });
+        return signs;
+    }
+    let joints = match &one.sight {
+        Sight::Unasked => return signs,
+        Sight::Nobody => {
+            signs.push(Sign::Nobody);
+            return signs;
+        }
+        Sight::Person(joints) => joints,
+    };
+    let parts = joints.outside(one.frame.size);
+    let found = [
+        (one.is_accompanied, Sign::Accompanied),
+        (joints.lies(), Sign::Lies),
+        (!joints.lies() && joints.sits(), Sign::Sits),
+        (!joints.lies() && joints.facing() == Some(Facing::Side), Sign::FromTheSide),
+        (!parts.is_empty(), Sign::Outside { parts }),
+    ];
+    signs.extend(found.into_iter().filter(|(is_so, _)| *is_so).map(|(_, sign)| sign));
+    signs
+}
+
 /// The doubts about both photographs.
 pub(super) fn doubts(front: &Cutout, back: &Cutout, swapped: bool) -> Vec<Doubt> {
     let mut doubts = Vec::new();
@@ -151,33 +202,7 @@ pub(super) fn doubts(front: &Cutout, back: &Cutout, swapped: bool) -> Vec<Doubt>
         doubts.push(Doubt { photographs, sign });
     };
     for one in [front, back] {
-        let borders = borders(&one.mask);
-        if borders >= BORDERS {
-            add(&[one], Sign::TouchesBorders { borders });
-        }
-        let Rect { width, height, .. } = one.report.person;
-        if width as f32 > WIDEST * height as f32 {
-            add(&[one], Sign::Wide { size: [width, height] });
-            // The network knows upright people.
-            continue;
-        }
-        let joints = match &one.sight {
-            Sight::Unasked => continue,
-            Sight::Nobody => {
-                add(&[one], Sign::Nobody);
-                continue;
-            }
-            Sight::Person(joints) => joints,
-        };
-        let parts = joints.outside(one.frame.size);
-        let signs = [
-            (one.is_accompanied, Sign::Accompanied),
-            (joints.lies(), Sign::Lies),
-            (!joints.lies() && joints.sits(), Sign::Sits),
-            (!joints.lies() && joints.facing() == Some(Facing::Side), Sign::FromTheSide),
-            (!parts.is_empty(), Sign::Outside { parts }),
-        ];
-        signs.into_iter().filter(|(is_so, _)| *is_so).for_each(|(_, sign)| add(&[one], sign));
+        signs(one).into_iter().for_each(|sign| add(&[one], sign));
     }
     let both = [front, back];
     if are_equal(front, back, false) {

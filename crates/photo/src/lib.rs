@@ -37,7 +37,7 @@ use cutout::Cutout;
 pub use doubts::{Doubt, Sign};
 pub use exif_camera::{ELEVATIONS, FOCALS, Frame, Shot, Viewpoint};
 use exposure::match_back;
-pub use joints::{Facing, Part};
+pub use joints::{Facing, Joint, Part};
 pub use person::{
     DISTANCES, DistanceBy, ElevationBy, Lens, NoGaussian, Person, Seat, Told, Unplaced, person,
 };
@@ -141,13 +141,27 @@ pub fn read(
     Ok(made)
 }
 
-/// Colours and mask of one photograph, as [`read`] computes them for [`Placement::Training`].
+/// A photograph without its background, and what was seen in it.
+pub struct CutOut {
+    /// Colours of the photograph.
+    pub rgb: RgbImage,
+    /// Coverage by the person.
+    pub mask: GrayImage,
+    /// The person's 33 joints; none if nobody is recognised.
+    pub joints: Vec<Joint>,
+    /// What is wrong with the photograph.
+    pub signs: Vec<Sign>,
+}
+
+/// One photograph, as [`read`] treats it with [`Placement::Training`].
 ///
 /// # Errors
 /// As [`read`].
-pub fn cut_out(source: Source, cutting: Cutting) -> Result<(RgbImage, GrayImage), FileError> {
-    let Cutout { rgb, mask, .. } = Cutout::read(source, cutting, 0, Placement::Training { height: 0 })?;
-    Ok((rgb, mask))
+pub fn cut_out(source: Source, cutting: Cutting) -> Result<CutOut, FileError> {
+    let cutout = Cutout::read(source, cutting, 0, Placement::Training { height: 0 })?;
+    let joints = cutout.sight.joints().map_or_else(Vec::new, |joints| joints.0.clone());
+    let signs = doubts::signs(&cutout);
+    Ok(CutOut { rgb: cutout.rgb, mask: cutout.mask, joints, signs })
 }
 
 /// A channel in [0, 1].

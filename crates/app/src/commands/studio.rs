@@ -8,13 +8,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use clap::Args;
+use glam::Vec2;
 use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
 use image::{GrayImage, ImageFormat};
-use serde_json::json;
+use serde_json::{Value, json};
 use snapsnap_mesh::picture;
 use snapsnap_net::Reconstructor;
-use snapsnap_photo::{Content, Cutting, Source, Told, cut_out, person};
+use snapsnap_photo::{Content, CutOut, Cutting, Doubt, Joint, Sign, Source, Told, cut_out, person};
 use snapsnap_splat::scene::Stored;
 use ureq::http::StatusCode;
 
@@ -92,7 +93,8 @@ impl Studio {
         self.networks.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A photograph → its picture, as JPEG, and the person's mask, as PNG, both reduced to [`PREVIEW`].
+    /// A photograph → its picture, as JPEG, and the person's mask, as PNG, both reduced to [`PREVIEW`]; as JSON the
+    /// joints, each column, row (shares of the picture) and probability of being seen, and what is wrong.
     fn cut_out(&self, request: &Request, body: &mut Body) -> Result<Answer, Answer> {
         let upload = body.read(LARGEST)?;
         let job = Job::of(request);
@@ -101,7 +103,7 @@ impl Studio {
         let networks = self.networks(&job);
         job.step("removing the background");
         let source = Source { content: Content::Bytes(upload.as_ref()), ..Source::file(name) };
-        let (rgb, mask) = cut_out(source, Cutting::Missing)?;
+        let CutOut { rgb, mask, joints, signs } = cut_out(source, Cutting::Missing)?;
         drop((networks, upload));
         let [width, height] = reduced(rgb.width(), rgb.height());
         let small = imageops::resize(&rgb, width, height, FilterType::Triangle);
@@ -110,8 +112,17 @@ impl Studio {
         let cannot = |e| Failure::Internal(format!("a preview: cannot encode: {e}"));
         JpegEncoder::new_with_quality(&mut content, QUALITY).encode_image(&small).map_err(cannot)?;
         mask.write_to(&mut Cursor::new(&mut png), ImageFormat::Png).map_err(cannot)?;
-        let lengths = format!("{},{}", content.len(), png.len());
+        let whole = Vec2::new(rgb.width() as f32, rgb.height() as f32);
+        let joint = |Joint { at, seen }: &Joint| [at.x / whole.x, at.y / whole.y, *seen];
+        let signs = signs.iter().map(|sign| said(sign.to_string(), sign));
+        let seen = json!({
+            "joints": joints.iter().map(joint).collect::<Vec<_>>(),
+            "signs": signs.collect::<Vec<_>>(),
+        });
+        let mut seen = seen.to_string().into_bytes();
+        let lengths = format!("{},{},{}", content.len(), png.len(), seen.len());
         content.append(&mut png);
+        content.append(&mut seen);
         let mut answer = page::answer("application/octet-stream", Arc::new(content));
         answer.headers.push(("X-Parts", lengths));
         Ok(answer)
@@ -145,7 +156,12 @@ impl Studio {
         read.cutouts = Vec::new();
         let person = person(&read, &networks, told, &|step| job.step(step))
             .map_err(|none| text(StatusCode::UNPROCESSABLE_ENTITY, &none.to_string()))?;
-        let doubts: Vec<String> = read.doubts.iter().map(ToString::to_string).collect();
+        let doubt = |doubt: &Doubt| {
+            let mut said = said(doubt.to_string(), &doubt.sign);
+            said["of"] = json!(doubt.photographs);
+            said
+        };
+        let doubts: Vec<Value> = read.doubts.iter().map(doubt).collect();
         let stored = Stored::of(&person.gaussians).map_err(Failure::from)?;
         // Frees buffers, since the next person may come in an hour.
         snapsnap_ops::release_buffers();
@@ -175,6 +191,12 @@ impl Studio {
             Ok(Arc::new(download.make(&stored, step)?))
         })
     }
+}
+
+/// What is wrong with photographs: as a whole text, and as a note beside parts of the body.
+fn said(text: String, sign: &Sign) -> Value {
+    let (note, parts) = sign.of_parts();
+    json!({ "text": text, "note": note, "parts": parts })
 }
 
 /// The size of a picture whose longer side is at most [`PREVIEW`].

@@ -5,6 +5,18 @@ const WIDTH = 0.04;
 /** How bright the background is shown. */
 const BEHIND = 0.25;
 
+/** Bones by the part of the body: pairs of joints. A note stands beside the second joint of a part. */
+const BONES = {
+  "left-arm": [[11, 13], [13, 15], [15, 19]],
+  "right-arm": [[12, 14], [14, 16], [16, 20]],
+  "left-leg": [[23, 25], [25, 27], [27, 31]],
+  "right-leg": [[24, 26], [26, 28], [28, 32]],
+  head: [[7, 0], [0, 8]],
+  torso: [[11, 12], [11, 23], [12, 24], [23, 24]],
+};
+/** Least probability of a joint that is drawn. */
+const SEEN = 0.5;
+
 const canvasOf = (width, height) => Object.assign(document.createElement("canvas"), { width, height });
 
 export class Drawing {
@@ -47,15 +59,18 @@ export class Drawing {
 
   clear() {
     this.picture = null;
+    this.joints = [];
+    this.notes = {};
     this.lines = [];
     this.current = null;
     this.drawn?.(0);
   }
 
-  /** Shows a picture and its mask, white on the person, both of one size. */
-  open(picture, mask) {
+  /** Shows a picture and its mask, white on the person, both of one size, and the person's joints. */
+  open(picture, mask, joints) {
     this.clear();
     this.picture = picture;
+    this.joints = joints;
     [this.canvas.width, this.canvas.height] = [picture.width, picture.height];
     // A canvas masks by transparency, not by brightness.
     const grey = canvasOf(mask.width, mask.height).getContext("2d");
@@ -132,6 +147,43 @@ export class Drawing {
     context.drawImage(this.picture, 0, 0);
     context.globalAlpha = 1;
     context.drawImage(this.cut, 0, 0);
+    this.showJoints(context);
+  }
+
+  /** Writes notes beside parts of the body: `{ part: text }`. */
+  note(notes) {
+    this.notes = notes;
+    if (this.picture) {
+      this.show();
+    }
+  }
+
+  /** Faint bones; a part with a note is brighter. */
+  showJoints(context) {
+    const { width, height } = this.canvas;
+    const unit = Math.max(width, height) / 1024;
+    const place = ([x, y]) => [x * width, y * height];
+    for (const [part, bones] of Object.entries(BONES)) {
+      const color = part in this.notes ? "#fc6" : "#fff";
+      context.globalAlpha = part in this.notes ? 0.9 : 0.4;
+      for (const ends of bones.map((bone) => bone.map((joint) => this.joints[joint]))) {
+        if (ends.every((joint) => joint?.[2] > SEEN)) {
+          this.line(context, { width: 4 * unit, points: ends.map(place) }, color);
+        }
+      }
+    }
+    context.globalAlpha = 1;
+    context.font = `${30 * unit}px system-ui, sans-serif`;
+    for (const [part, text] of Object.entries(this.notes).filter(([part]) => BONES[part] && this.joints.length)) {
+      const [x, y] = place(this.joints[BONES[part][0][1]]);
+      const long = context.measureText(text).width;
+      // On the outer side of the limb.
+      const wanted = 2 * x < place(this.joints[23])[0] + place(this.joints[24])[0] ? x - 16 * unit - long : x + 16 * unit;
+      const [left, top] = [Math.min(Math.max(wanted, 0), width - long), Math.min(Math.max(y, 40 * unit), height - 12 * unit)];
+      Object.assign(context, { lineWidth: 6 * unit, strokeStyle: "#000", fillStyle: "#fc6" });
+      context.strokeText(text, left, top);
+      context.fillText(text, left, top);
+    }
   }
 
   /** The lines as a picture for the server: white keeps, black removes, 128 changes nothing. Empty without lines. */

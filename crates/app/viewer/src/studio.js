@@ -8,6 +8,10 @@ const element = (id) => document.getElementById(id);
 
 /** Largest photograph in bytes, as the server knows it. */
 const LARGEST = 128 * 2 ** 20;
+
+/** What stands beside parts of the body. */
+const notesOf = (signs) => Object.fromEntries(signs.flatMap(({ note, parts }) => parts.map((part) => [part, note])));
+
 /** One of the two photographs: a place for a file, then the picture with its mask. */
 class Photograph {
   constructor(side, changed) {
@@ -96,14 +100,17 @@ class Photograph {
     this.say("removing the background …");
     try {
       const answer = await ask("./cutout", { method: "POST", body: file }, (step) => own === this.asked && this.say(`${step} …`));
-      const [length] = answer.headers.get("x-parts").split(",").map(Number);
+      const [picture, mask] = answer.headers.get("x-parts").split(",").map(Number);
       const bytes = await answer.blob();
-      const pictures = await Promise.all([bytes.slice(0, length), bytes.slice(length)].map((part) => createImageBitmap(part)));
+      const pictures = [bytes.slice(0, picture), bytes.slice(picture, picture + mask)].map((part) => createImageBitmap(part));
+      const opened = await Promise.all(pictures);
+      const seen = JSON.parse(await bytes.slice(picture + mask).text());
       if (own === this.asked) {
         this.file = file;
-        this.drawing.open(...pictures);
+        this.drawing.open(...opened, seen.joints);
+        this.drawing.note(notesOf(seen.signs));
         this.root.classList.add("cut");
-        this.say("");
+        this.say(seen.signs.map((sign) => sign.text).join("; "));
       }
     } catch (error) {
       if (own === this.asked) {
@@ -162,7 +169,11 @@ export function openStudio(show) {
       const answer = await ask("./reconstruct", { method: "POST", headers, body: new Blob(parts) }, step);
       const person = await answer.json();
       if (isWanted()) {
-        const warnings = person.warnings.map((text) => {
+        for (const photograph of photographs) {
+          const own = person.warnings.filter(({ of }) => of.includes(`${photograph.root.dataset.side} photograph`));
+          photograph.drawing.note(notesOf(own));
+        }
+        const warnings = person.warnings.map(({ text }) => {
           const item = document.createElement("li");
           item.textContent = text;
           return item;
