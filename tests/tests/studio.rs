@@ -347,7 +347,10 @@ mod browser {
         };
         assert_eq!(notes(&whole), (String::new(), 0));
         let (said, colored) = notes(&cut);
-        assert!(said.starts_with("outside of the picture: left leg, right leg") && colored > 500, "{said} {colored}");
+        assert!(
+            said.starts_with("outside of the picture: left leg, right leg") && colored > 500,
+            "{said} {colored}"
+        );
         assert!(page.errors.is_empty(), "{:?}", page.errors);
     }
 
