@@ -3,6 +3,7 @@
 
 use std::collections::{BTreeSet, HashMap};
 
+use image::imageops::{FilterType, resize};
 use image::{GrayImage, RgbImage};
 
 use crate::geometry::nearest;
@@ -34,10 +35,11 @@ pub struct Traces {
 }
 
 impl Palette {
-    /// The colours of photographs with true masks.
-    pub fn new(photographs: &[(RgbImage, GrayImage)]) -> Self {
+    /// The colours of photographs with the masks of `truth`.
+    pub fn new(photographs: &[(RgbImage, GrayImage)], truth: &[(RgbImage, GrayImage)]) -> Self {
         let of = |is_meant: fn(u8) -> bool| {
-            let pixels = photographs.iter().flat_map(|(color, mask)| color.pixels().zip(mask.pixels()));
+            let pairs = photographs.iter().zip(truth);
+            let pixels = pairs.flat_map(|((color, _), (_, mask))| color.pixels().zip(mask.pixels()));
             let meant = pixels.filter(|(_, share)| is_meant(share[0]));
             meant.map(|(pixel, _)| cell(pixel.0.map(|v| f32::from(v) / 255.0))).collect()
         };
@@ -51,8 +53,11 @@ impl Palette {
         let own: Vec<usize> = (0..mask.len()).filter(|i| mask[*i] > 0.5).collect();
         let true_colors = own.iter().map(|i| cell(color(target, *i)));
         let person: BTreeSet<Cell> = self.person.iter().copied().chain(true_colors).collect();
+        let is_shown = |i: &usize| color(image, *i).iter().any(|v| *v > SHOWN);
         let mut counts: HashMap<Cell, usize> = HashMap::new();
-        own.iter().for_each(|i| *counts.entry(cell(color(image, *i))).or_default() += 1);
+        own.iter()
+            .filter(|i| is_shown(i))
+            .for_each(|i| *counts.entry(cell(color(image, *i))).or_default() += 1);
         let (cells, counts): (Vec<Cell>, Vec<usize>) = counts.into_iter().unzip();
         let [cells, person, background] = [cells, list(&person), list(&self.background)].map(places);
         let foreign = if background.is_empty() || person.is_empty() || cells.is_empty() {
@@ -62,19 +67,18 @@ impl Palette {
             let is_foreign = |i: &usize| own[*i].1 > other[*i].1.max(DISTINCT);
             (0..cells.len()).filter(is_foreign).map(|i| counts[i]).sum()
         };
-        let is_beside = |i: &usize| {
-            color(image, *i).iter().any(|v| *v > SHOWN) && !region.counts(i % image.width, i / image.width)
-        };
+        let is_beside = |i: &usize| is_shown(i) && !region.counts(i % image.width, i / image.width);
         let beside = (0..mask.len()).filter(is_beside).count();
         let share = |count: usize| count as f64 / own.len().max(1) as f64;
         Traces { foreign: share(foreign), beside: share(beside) }
     }
 }
 
-/// Intersection over union of two masks of one size, with pixels from 128 on.
-pub fn overlap(a: &GrayImage, b: &GrayImage) -> f64 {
+/// Intersection over union of a mask and the true one, with pixels from 128 on, at the first one's size.
+pub fn overlap(found: &GrayImage, truth: &GrayImage) -> f64 {
+    let truth = resize(truth, found.width(), found.height(), FilterType::Triangle);
     let count = |is_meant: fn(bool, bool) -> bool| {
-        a.pixels().zip(b.pixels()).filter(|(a, b)| is_meant(a[0] >= 128, b[0] >= 128)).count() as f64
+        found.pixels().zip(truth.pixels()).filter(|(a, b)| is_meant(a[0] >= 128, b[0] >= 128)).count() as f64
     };
     count(|a, b| a && b) / count(|a, b| a || b).max(1.0)
 }
@@ -105,7 +109,8 @@ mod tests {
             Rgb(if is_person(x, y) { [200, 30, 30] } else { [30, 30, 220] })
         });
         let mask = GrayImage::from_fn(30, 30, |x, y| Luma([if is_person(x, y) { 255 } else { 0 }]));
-        let palette = Palette::new(&[(photograph, mask.clone())]);
+        let palette =
+            Palette::new(&[(photograph.clone(), GrayImage::new(30, 30))], &[(photograph, mask.clone())]);
         let picture = |color: &dyn Fn(u32, u32) -> [u8; 3]| {
             let pixels = RgbImage::from_fn(30, 30, |x, y| Rgb(color(x, y)));
             Picture::from_file(pixels.into(), "picture").expect("a picture")
@@ -113,8 +118,9 @@ mod tests {
         let share: Vec<f32> = mask.pixels().map(|m| f32::from(m[0]) / 255.0).collect();
         let region = Region::masked(&share, [30, 30], 1).expect("a person");
         let target = picture(&|x, y| if is_person(x, y) { [220, 200, 30] } else { [0; 3] });
-        // A column of the wall, a shade of the truth, a column beside the margin.
+        // A column of the wall, a shade of the truth, a column beside the margin, and a hole.
         let image = picture(&|x, y| match x {
+            12 if y == 12 => [0; 3],
             10 if is_person(x, y) => [40, 40, 210],
             22 if (5..25).contains(&y) => [90, 90, 90],
             _ if is_person(x, y) => [210, 190, 40],

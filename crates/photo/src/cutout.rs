@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::mem::replace;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 
 use image::{DynamicImage, GrayImage, RgbImage};
 use snapsnap_base::FileError;
@@ -49,7 +50,12 @@ impl<'a> Cutout<'a> {
     ) -> Result<Self, FileError> {
         let Source { path, content, mask, strokes } = source;
         let is_file = !matches!(content, Content::Pixels(..));
-        let picture = source.decode()?;
+        let picture = {
+            // One after the other: decoders need the most memory.
+            static DECODING: Mutex<()> = Mutex::new(());
+            let _alone = DECODING.lock().unwrap_or_else(PoisonError::into_inner);
+            source.decode()?
+        };
         let (width, height) = (picture.width(), picture.height());
         if placement == Placement::AsIs && (width as usize, height as usize) != (side, side) {
             let message =

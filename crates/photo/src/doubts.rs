@@ -93,7 +93,7 @@ impl Sign {
     pub fn of_parts(&self) -> (&'static str, &[Part]) {
         match self {
             Self::Outside { parts } => ("outside of the picture", parts),
-            Self::Moved { parts } => ("elsewhere in the back photograph", parts),
+            Self::Moved { parts } => ("elsewhere", parts),
             _ => ("", &[]),
         }
     }
@@ -132,13 +132,11 @@ impl fmt::Display for Sign {
             }
             Self::Lies => write!(f, "the person does not stand upright"),
             Self::Sits => write!(f, "the person seems to sit: the person should stand"),
-            Self::Outside { .. } | Self::Moved { .. } => {
-                let (what, parts) = self.of_parts();
-                let why = match self {
-                    Self::Moved { .. } => "both need one pose",
-                    _ => "the whole person must be visible",
-                };
-                write!(f, "{what}: {}: {why}", list(parts))
+            Self::Outside { parts } => {
+                write!(f, "outside of the picture: {}: the whole person must be visible", list(parts))
+            }
+            Self::Moved { parts } => {
+                write!(f, "elsewhere in the back photograph: {}: both need one pose", list(parts))
             }
             Self::LittleOverlap { overlap } => {
                 let share = (100.0 * *overlap).round();

@@ -85,8 +85,8 @@ pub fn read(
     focal: Option<f64>,
 ) -> Result<Photographs, FileError> {
     let cut_out = |source| Cutout::read(source, cutting, side, placement);
-    // Threads of their own: a thread of the pool must not wait for the pool.
-    let cutouts = if rayon::current_thread_index().is_none() {
+    // Threads of their own: a thread of the pool must not wait for the pool. Training samples have masks.
+    let cutouts = if cutting != Cutting::Given && rayon::current_thread_index().is_none() {
         std::thread::scope(|scope| {
             let threads: Vec<_> =
                 sources.iter().map(|source| scope.spawn(move || cut_out(*source))).collect();
@@ -142,7 +142,7 @@ pub fn read(
 }
 
 /// A photograph without its background, and what was seen in it.
-pub struct CutOut {
+pub struct Figure {
     /// Colours of the photograph.
     pub rgb: RgbImage,
     /// Coverage by the person.
@@ -157,11 +157,11 @@ pub struct CutOut {
 ///
 /// # Errors
 /// As [`read`].
-pub fn cut_out(source: Source, cutting: Cutting) -> Result<CutOut, FileError> {
+pub fn cut_out(source: Source, cutting: Cutting) -> Result<Figure, FileError> {
     let cutout = Cutout::read(source, cutting, 0, Placement::Training { height: 0 })?;
     let joints = cutout.sight.joints().map_or_else(Vec::new, |joints| joints.0.clone());
     let signs = doubts::signs(&cutout);
-    Ok(CutOut { rgb: cutout.rgb, mask: cutout.mask, joints, signs })
+    Ok(Figure { rgb: cutout.rgb, mask: cutout.mask, joints, signs })
 }
 
 /// A channel in [0, 1].

@@ -29,6 +29,8 @@ const MOST_STEPS: f32 = 8.0;
 /// Squares of further looks, as multiples of the person's longer side, and whether the network sees the mirrored picture.
 /// The mean of all looks is steadier than one look.
 const AGAIN: [(f32, bool); 3] = [(1.2, true), (1.05, false), (1.05, true)];
+/// Largest change of the box's edges between looks at one person, in the same unit.
+const SAME: f32 = 0.2;
 /// Brightness of the background of pictures with a mask.
 const GREY: f32 = 150.0;
 /// Probability above which there is a person, a joint, or a person's pixel.
@@ -71,27 +73,38 @@ impl Look {
         };
         for _ in 1..LOOKS {
             let Some(next) = small.look_near(&last, network) else { break };
-            let moved = [0, 1].map(|i| (next.person[i] - last.person[i]).abs().max_element());
+            let moved = next.moved(&last);
             last = next;
-            if moved[0].max(moved[1]) < STEADY * last.seen[0].side.max_element() {
+            if moved < STEADY * last.seen[0].side.max_element() {
                 break;
             }
         }
         let mirrored = Small { picture: imageops::flip_horizontal(&small.picture), ..small };
         for (around, is_mirrored) in AGAIN {
+            let person = if is_mirrored { flipped(last.person, picture.width()) } else { last.person };
             let from = if is_mirrored { &mirrored } else { &small };
-            let [low, high] = last.person.map(|edge| edge / small.scale);
-            let person = match is_mirrored {
-                true => {
-                    [Vec2::new(small.size().x - high.x, low.y), Vec2::new(small.size().x - low.x, high.y)]
-                }
-                false => [low, high],
-            };
-            let again = from.look(person, around, network).into_iter().flat_map(|look| look.seen);
-            last.seen
-                .extend(again.map(|seen| if is_mirrored { seen.mirrored(picture.width()) } else { seen }));
+            let again = from.look(person.map(|edge| edge / small.scale), around, network);
+            let again = again.map(|look| if is_mirrored { look.mirrored(picture.width()) } else { look });
+            let again = again.filter(|look| look.moved(&last) < SAME * last.seen[0].side.max_element());
+            last.seen.extend(again.into_iter().flat_map(|look| look.seen));
         }
         Some(last)
+    }
+
+    /// Largest distance of an edge of the person's box from the edge in another look, in pixels of the photograph.
+    fn moved(&self, other: &Self) -> f32 {
+        let moved = [0, 1].map(|i| (self.person[i] - other.person[i]).abs().max_element());
+        moved[0].max(moved[1])
+    }
+
+    /// The person's box and pixels in the mirrored picture, whose width is given. Joints stay.
+    fn mirrored(mut self, width: u32) -> Self {
+        self.person = flipped(self.person, width);
+        for seen in &mut self.seen {
+            seen.corner.x = width as f32 - seen.corner.x - seen.side.x;
+            seen.mask.chunks_exact_mut(SIDE).for_each(<[f32]>::reverse);
+        }
+        self
     }
 
     /// Whether another person stands beside this one in the picture.
@@ -126,14 +139,16 @@ impl Look {
         small.look([corner, corner + size].map(|edge| edge / small.scale), AROUND[1], network)
     }
 
-    /// Probabilities of the pixels of a part of the picture, at this size (rows, columns).
+    /// Probabilities of the pixels of a part of the picture, at this size (rows, columns): means of the looks that saw
+    /// the pixel, 0 where none did.
     pub fn probabilities(&self, part: Rect, size: [usize; 2]) -> Vec<f32> {
-        let mut sum = vec![0.0; size[0] * size[1]];
+        let mut sums = vec![(0.0, 0.0_f32); size[0] * size[1]];
         for seen in &self.seen {
-            sum.iter_mut().zip(seen.probabilities(part, size)).for_each(|(sum, p)| *sum += p);
+            for ((sum, count), p) in sums.iter_mut().zip(seen.probabilities(part, size)) {
+                (*sum, *count) = (*sum + p.unwrap_or(0.0), *count + f32::from(u8::from(p.is_some())));
+            }
         }
-        sum.iter_mut().for_each(|p| *p /= self.seen.len() as f32);
-        sum
+        sums.into_iter().map(|(sum, count)| sum / count.max(1.0)).collect()
     }
 
     /// Pixels of the network's input per row of the photograph.
@@ -142,15 +157,14 @@ impl Look {
     }
 }
 
-impl Seen {
-    /// What was seen in a mirrored picture of this width.
-    fn mirrored(mut self, width: u32) -> Self {
-        self.corner.x = width as f32 - self.corner.x - self.side.x;
-        self.mask.chunks_exact_mut(SIDE).for_each(<[f32]>::reverse);
-        self
-    }
+/// A box in the mirrored picture, whose width is given.
+fn flipped([low, high]: [Vec2; 2], width: u32) -> [Vec2; 2] {
+    [Vec2::new(width as f32 - high.x, low.y), Vec2::new(width as f32 - low.x, high.y)]
+}
 
-    fn probabilities(&self, part: Rect, [rows, columns]: [usize; 2]) -> Vec<f32> {
+impl Seen {
+    /// Probabilities of the pixels of a part of the picture; `None` outside of the square.
+    fn probabilities(&self, part: Rect, [rows, columns]: [usize; 2]) -> Vec<Option<f32>> {
         let step = self.side / SIDE as f32;
         let at = |first: u32,
                   length: u32,
@@ -169,10 +183,8 @@ impl Seen {
         };
         let down = at(part.y, part.height, rows, self.corner.y, step.y);
         let across = at(part.x, part.width, columns, self.corner.x, step.x);
-        let value = |down: Option<_>, across: Option<_>| match (down, across) {
-            (Some(down), Some(across)) => interpolate(&self.mask, SIDE, [down, across]),
-            _ => 0.0,
-        };
+        let value =
+            |down: Option<_>, across: Option<_>| Some(interpolate(&self.mask, SIDE, [down?, across?]));
         down.iter().flat_map(|down| across.iter().map(|across| value(*down, *across))).collect()
     }
 }
@@ -284,6 +296,25 @@ impl Small {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A person on the left of a picture: mirrored looks find it there as well.
+    #[test]
+    fn mirrored_looks_see_the_same_pixels() {
+        let is_person = |x: u32, y: u32| (20..60).contains(&x) && (30..170).contains(&y);
+        let picture =
+            RgbImage::from_fn(200, 200, |x, y| image::Rgb([if is_person(x, y) { 255 } else { 0 }; 3]));
+        let network = |rgb: &[f32]| Pose {
+            landmarks: vec![[-1.0, -1.0, 0.0, -9.0, -9.0]; 39],
+            presence: 1.0,
+            mask: rgb[..SIDE * SIDE].to_vec(),
+        };
+        let look = Look::find(&picture, &network).expect("a person");
+        assert_eq!(look.seen.len(), 4);
+        let found = look.probabilities(Rect { x: 0, y: 0, width: 200, height: 200 }, [200; 2]);
+        let wrong = |(i, p): (usize, &f32)| (*p > 0.5) != is_person(i as u32 % 200, i as u32 / 200);
+        let wrong = found.iter().enumerate().filter(|(i, p)| wrong((*i, *p))).count();
+        assert!(wrong < 100, "{wrong} pixels");
+    }
 
     /// Pictures of extreme sizes, with a network that answers anything.
     #[test]

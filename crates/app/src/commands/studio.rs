@@ -15,7 +15,7 @@ use image::{GrayImage, ImageFormat};
 use serde_json::{Value, json};
 use snapsnap_mesh::picture;
 use snapsnap_net::Reconstructor;
-use snapsnap_photo::{Content, CutOut, Cutting, Doubt, Joint, Sign, Source, Told, cut_out, person};
+use snapsnap_photo::{Content, Cutting, Doubt, Figure, Joint, Sign, Source, Told, cut_out, person};
 use snapsnap_splat::scene::Stored;
 use ureq::http::StatusCode;
 
@@ -103,7 +103,7 @@ impl Studio {
         let networks = self.networks(&job);
         job.step("removing the background");
         let source = Source { content: Content::Bytes(upload.as_ref()), ..Source::file(name) };
-        let CutOut { rgb, mask, joints, signs } = cut_out(source, Cutting::Missing)?;
+        let Figure { rgb, mask, joints, signs } = cut_out(source, Cutting::Missing)?;
         drop((networks, upload));
         let [width, height] = reduced(rgb.width(), rgb.height());
         let small = imageops::resize(&rgb, width, height, FilterType::Triangle);

@@ -176,13 +176,13 @@ export class Drawing {
     context.font = `${30 * unit}px system-ui, sans-serif`;
     for (const [part, text] of Object.entries(this.notes).filter(([part]) => BONES[part] && this.joints.length)) {
       const [x, y] = place(this.joints[BONES[part][0][1]]);
-      const long = context.measureText(text).width;
+      const long = Math.min(context.measureText(text).width, width);
       // On the outer side of the limb.
       const wanted = 2 * x < place(this.joints[23])[0] + place(this.joints[24])[0] ? x - 16 * unit - long : x + 16 * unit;
       const [left, top] = [Math.min(Math.max(wanted, 0), width - long), Math.min(Math.max(y, 40 * unit), height - 12 * unit)];
       Object.assign(context, { lineWidth: 6 * unit, strokeStyle: "#000", fillStyle: "#fc6" });
-      context.strokeText(text, left, top);
-      context.fillText(text, left, top);
+      context.strokeText(text, left, top, width);
+      context.fillText(text, left, top, width);
     }
   }
 

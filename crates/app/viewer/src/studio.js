@@ -23,6 +23,7 @@ class Photograph {
     element("pair").append(this.root);
     this.changed = changed;
     this.file = null;
+    this.signs = [];
     this.asked = 0;
     this.drawing = new Drawing(this.root.querySelector("canvas"), (strokes) => this.drawn(strokes));
     const part = (selector) => this.root.querySelector(selector);
@@ -79,6 +80,7 @@ class Photograph {
   clear() {
     this.asked += 1;
     this.file = null;
+    this.signs = [];
     this.drawing.clear();
     this.root.classList.remove("cut", "busy");
     this.say("");
@@ -102,13 +104,13 @@ class Photograph {
       const answer = await ask("./cutout", { method: "POST", body: file }, (step) => own === this.asked && this.say(`${step} …`));
       const [picture, mask] = answer.headers.get("x-parts").split(",").map(Number);
       const bytes = await answer.blob();
-      const pictures = [bytes.slice(0, picture), bytes.slice(picture, picture + mask)].map((part) => createImageBitmap(part));
-      const opened = await Promise.all(pictures);
+      const parts = [bytes.slice(0, picture), bytes.slice(picture, picture + mask)];
+      const pictures = await Promise.all(parts.map((part) => createImageBitmap(part)));
       const seen = JSON.parse(await bytes.slice(picture + mask).text());
       if (own === this.asked) {
         this.file = file;
-        this.drawing.open(...opened, seen.joints);
-        this.drawing.note(notesOf(seen.signs));
+        this.signs = seen.signs;
+        this.drawing.open(...pictures, seen.joints);
         this.root.classList.add("cut");
         this.say(seen.signs.map((sign) => sign.text).join("; "));
       }
@@ -131,7 +133,12 @@ export function openStudio(show) {
   const changed = () => {
     make.disabled = working || !photographs.every((photograph) => photograph.ready);
   };
-  const photographs = ["Front", "Back"].map((side) => new Photograph(side, () => changed()));
+  const exchanged = () => {
+    photographs.forEach((photograph) => photograph.drawing.note(notesOf(photograph.signs)));
+    element("warnings").replaceChildren();
+    changed();
+  };
+  const photographs = ["Front", "Back"].map((side) => new Photograph(side, () => exchanged()));
   changed();
   const say = (text) => {
     element("work").textContent = text;
@@ -145,7 +152,6 @@ export function openStudio(show) {
   element("again").addEventListener("click", () => {
     photographs.forEach((photograph) => photograph.clear());
     say("");
-    element("warnings").replaceChildren();
   });
 
   // Whoever starts again meanwhile does not want the former person.
@@ -169,9 +175,9 @@ export function openStudio(show) {
       const answer = await ask("./reconstruct", { method: "POST", headers, body: new Blob(parts) }, step);
       const person = await answer.json();
       if (isWanted()) {
-        for (const photograph of photographs) {
-          const own = person.warnings.filter(({ of }) => of.includes(`${photograph.root.dataset.side} photograph`));
-          photograph.drawing.note(notesOf(own));
+        for (const photograph of photographs.filter(({ file }, i) => file === files[i])) {
+          const about = person.warnings.filter(({ of }) => of.includes(`${photograph.root.dataset.side} photograph`));
+          photograph.drawing.note(notesOf(about));
         }
         const warnings = person.warnings.map(({ text }) => {
           const item = document.createElement("li");

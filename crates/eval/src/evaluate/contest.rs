@@ -111,6 +111,7 @@ impl Contestant {
             Self::Model(.., model) => {
                 let is_changed = model.photographs != PhotographChanges::default();
                 let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
+                let true_masks = &item.photographs;
                 let item = own.as_ref().unwrap_or(item);
                 let mut made = model.reconstruct(item, inputs)?;
                 let aligned = match metrics.align {
@@ -128,7 +129,7 @@ impl Contestant {
                     points,
                     lost: made.lost,
                     masks: made.masks,
-                    palette: has_background.then(|| Palette::new(&item.photographs)),
+                    palette: has_background.then(|| Palette::new(&item.photographs, true_masks)),
                     time: Some(made.time),
                     aligned,
                     ..plain(made.gaussians)?

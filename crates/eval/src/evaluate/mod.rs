@@ -19,7 +19,7 @@ use snapsnap_data::sample::{PhotographChanges, TestItem};
 use snapsnap_splat::Gaussians;
 
 use crate::EvalError;
-use crate::foreign::{Palette, Traces};
+use crate::foreign::Traces;
 use crate::geometry::Align;
 use crate::lpips::Lpips;
 use crate::pictures::Picture;
@@ -265,6 +265,8 @@ impl Place<'_> {
         let side = people.side(&config.views);
         let (target, mask) = people.target(self.row, view, side)?;
         let masked = || Region::masked(&mask, [side, side], margin(side));
+        let has_palette = shown.iter().flatten().any(|shown| shown.palette.is_some());
+        let around = has_palette.then(masked).transpose()?;
         let region = |protocol: &Protocol| match protocol {
             Protocol::Paper => Region::paper(&target),
             Protocol::Masked => masked(),
@@ -277,10 +279,9 @@ impl Place<'_> {
             let judged = || {
                 let image = self.contestants[i].picture(shown, camera, view, side, &config.views)?;
                 let scores = regions.iter().map(|region| score(&image, region)).collect::<Result<_, _>>()?;
-                let traces = |palette: &Palette| {
-                    masked().map(|region| palette.traces(&image, &target, &mask, &region))
-                };
-                Ok((scores, shown.palette.as_ref().map(traces).transpose()?))
+                let palette = shown.palette.as_ref().zip(around.as_ref());
+                let traces = palette.map(|(palette, region)| palette.traces(&image, &target, &mask, region));
+                Ok((scores, traces))
             };
             Some((i, judged()))
         };

@@ -111,8 +111,8 @@ impl Evaluation<'_> {
             let header = ["", "IoU of the masks", "foreign colour, %", "beside the person, %"];
             let _ = writeln!(
                 text,
-                "## Photographs\n\nIoU of the cut-outs and the true masks. In the views from 45° to 135°, pixels whose colour lies nearer to \
-                 the background's than to the person's, and pixels that show something outside of the grown true mask, as shares of the \
+                "## Photographs\n\nIoU of the cut-outs and the true masks. In the views from 45° to 135°, pixels in a colour of the background \
+                 instead of the person's, and pixels that show something outside of the grown true mask, as shares of the \
                  person's pixels.\n\n{}",
                 table_markdown(&header, rows.into_iter())
             );
