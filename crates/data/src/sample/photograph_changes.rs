@@ -101,7 +101,7 @@ impl PhotographChanges {
         let mut random = stream(&format!("photograph/{name}/{index}"));
         let plain = self.background.map(|background| background.map(|v| 255.0 * v));
         let scene = self.scene.map(|scene| behind(scene, &color, &mask, &mut random));
-        if plain.is_some() || scene.is_some() {
+        if self.has_background() {
             for (x, y, pixel) in color.enumerate_pixels_mut() {
                 let share = f32::from(mask.get_pixel(x, y).0[0]) / 255.0;
                 let other = scene.as_ref().map(|scene| scene.get_pixel(x, y).0.map(f32::from));
