@@ -21,6 +21,9 @@ pub const RECEPTIVE_RADIUS: usize = 100;
 /// `network.pair_degrees` of a front and a back photograph.
 pub const OPPOSITE: f64 = 180.0;
 
+/// Pixels of the finest level per pixel of the coarsest level of a U-shaped network, along an axis.
+pub(crate) const CELL: usize = 8;
+
 const HULL_REACH: f64 = 0.05;
 /// Half of the range from black to white.
 const COLOR_LIMITS: [f64; 2] = [0.5; 2];
@@ -74,6 +77,9 @@ pub struct NetworkConfig {
     pub head: HeadKind,
     /// Whether the right and left heads exist; without them only the two photographed sides are predicted.
     pub side_heads: bool,
+    /// The network that refines the photographs' points; unset: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub details: Option<DetailsConfig>,
     /// How the maps of the unseen sides are made.
     pub sides: Sides,
     /// Channels of the completion network's four levels (pixels of 1, 2, 4 and 8 times the finest size).
@@ -148,6 +154,7 @@ impl Default for NetworkConfig {
             hooks: [0, 6, 9, 12],
             head: HeadKind::Dpt,
             side_heads: true,
+            details: None,
             sides: Sides::Predicted,
             side_dims: [32, 48, 64, 96],
             second_layer: false,
@@ -191,6 +198,11 @@ fn are_least_opacities(least: &[f64; 2]) -> bool {
 }
 
 impl NetworkConfig {
+    /// Pixels of the convolutional body's input per pixel of its finest level, along an axis.
+    pub(crate) fn stride(&self) -> usize {
+        self.patch / CELL
+    }
+
     /// Channels of a photograph for the network: colours, and the channels that the config adds.
     pub fn input_channels(&self) -> usize {
         3 + usize::from(self.mask_channel) + 2 * usize::from(self.ray_channels)
@@ -199,6 +211,23 @@ impl NetworkConfig {
     /// Largest distance in metres by which a point of an unseen side moves into the silhouettes.
     pub fn hull_reach(&self) -> f64 {
         if self.hull_margin.is_some() { self.hull_reach } else { 0.0 }
+    }
+}
+
+/// Size of the network that refines the photographs' points (docs/method.md, "Details").
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DetailsConfig {
+    /// Side of the square image of the canvas that the network receives, in pixels.
+    pub resolution: usize,
+    /// Channels of its four levels (pixels of 1, 2, 4 and 8 times the finest size).
+    #[serde(deserialize_with = "snapsnap_base::config::four")]
+    pub dims: [usize; 4],
+}
+
+impl Default for DetailsConfig {
+    fn default() -> Self {
+        Self { resolution: 512, dims: [24, 48, 72, 96] }
     }
 }
 

@@ -52,7 +52,7 @@ impl Prediction {
         let [b, _, colors, side, _] = images.dims();
         let input = record.timed("input", |_| {
             // All fronts, then all backs.
-            let photographs = images.swap_dims(0, 1).reshape([2 * b, colors, side, side]);
+            let photographs = images.clone().swap_dims(0, 1).reshape([2 * b, colors, side, side]);
             let of_input = masks.clone().swap_dims(0, 1).reshape([2 * b, 1, side, side]);
             Input::new(config, photographs, of_input, &window)
         });
@@ -65,14 +65,20 @@ impl Prediction {
             tokens: input.grid.iter().product(),
             channels,
         });
-        let images = input.images.clone();
+        let input_images = input.images.clone();
         let encoded = record.timed("encoder", |_| predictor.encode(input));
         let decoded = record.timed("decoders", |_| predictor.decode(encoded));
         let heads = if predictor.has_side_heads() { "heads (4)" } else { "heads (2)" };
         let mut maps = record.timed(heads, |_| predictor.heads(&decoded));
-        if maps.len() < predictor.views().len() {
-            maps = record.timed("completed sides", |_| predictor.complete(maps, &decoded, &images, &window));
+        let mut fine = Vec::new();
+        if predictor.has_details() {
+            fine = record.timed("details", |_| predictor.detailed(&mut maps, &images, masks, &window));
         }
+        if maps.len() < predictor.views().len() {
+            maps =
+                record.timed("completed sides", |_| predictor.complete(maps, &decoded, &input_images, &window));
+        }
+        maps.splice(..fine.len(), fine);
         let finished = |(view, map): (View, PointMap)| {
             (view, predictor.finished(config, view, map, &window, mask_of(view, masks).as_ref()))
         };

@@ -81,6 +81,8 @@ pub struct TrainingConfig {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Stage1Config {
+    /// Whether only `network.details` is trained. The other layers keep the weights with which the training begins.
+    pub only_details: bool,
     /// Weight of the mean error of differences between pixels that are 1, 2, 4 and 8 apart.
     pub relief_weight: f64,
 }
@@ -240,6 +242,9 @@ impl TrainConfig {
             return Some((key.into(), message));
         }
         let refuse = |key: &str, message: &str| Some((key.to_owned(), message.to_owned()));
+        if self.stage1.only_details && self.network.details.is_none() {
+            return refuse("stage1.only_details", "needs `network.details`");
+        }
         if t.precision == Precision::F16 {
             return refuse(
                 "training.precision",

@@ -3,6 +3,7 @@
 mod checkpoint;
 pub mod config;
 pub mod data;
+mod details;
 mod ema;
 mod error;
 mod events;

@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::Precision;
 use snapsnap_net::network::PointPredictor;
 use snapsnap_net::regressor::Regressor;
-use snapsnap_net::weights::schema::SIDE;
+use snapsnap_net::weights::schema::{DETAILS, SIDE};
 use snapsnap_net::weights::{NamedMapper, NamedVisitor, ParameterPath, map_named, visit_named};
 use snapsnap_ops::host;
 
@@ -34,6 +34,17 @@ pub(crate) struct Parameter {
 pub type Rows = BTreeMap<String, Tensor<1>>;
 
 impl Networks {
+    /// The same networks, of which only the network of details is trained.
+    pub fn with_trained_details(self) -> Self {
+        struct Freeze;
+        impl NamedMapper for Freeze {
+            fn map<const D: usize>(&mut self, path: &ParameterPath, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+                param.set_require_grad(path.name().starts_with(DETAILS))
+            }
+        }
+        self.map(&mut Freeze)
+    }
+
     /// Visits all parameters.
     pub fn visit(&self, visitor: &mut impl NamedVisitor) {
         if let Some(predictor) = &self.predictor {

@@ -31,7 +31,7 @@ pub struct Losses {
 impl Losses {
     /// The losses with their weights.
     pub fn parts(self, config: &Stage1Config) -> Vec<Part> {
-        let Stage1Config { relief_weight } = *config;
+        let relief_weight = config.relief_weight;
         let mut parts = vec![
             Part { name: "points", weight: 1.0, value: self.regression },
             Part { name: "confidence", weight: CONFIDENCE_WEIGHT, value: self.confidence },
@@ -75,7 +75,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
 }
 
 /// Pixel offsets: `0, 0` for the errors themselves, [`SPACINGS`] down and across for their differences.
-fn offsets(h: usize, w: usize) -> Vec<[usize; 2]> {
+pub(crate) fn offsets(h: usize, w: usize) -> Vec<[usize; 2]> {
     let apart = SPACINGS.into_iter().flat_map(|spacing| [[spacing, 0], [0, spacing]]);
     [[0, 0]].into_iter().chain(apart.filter(|[down, across]| *down < h && *across < w)).collect()
 }

@@ -18,6 +18,7 @@ use snapsnap_ops::host;
 use crate::TrainError;
 use crate::config::{Stage1Config, TrainConfig};
 use crate::data::Data;
+use crate::details;
 use crate::networks::Networks;
 use crate::points::losses;
 use crate::ranks::Ranks;
@@ -37,6 +38,7 @@ type Map = (usize, Vec<f32>, Vec<f32>);
 pub struct PointTask {
     networks: Config,
     losses: Stage1Config,
+    seed: u64,
     data: Data<Stage1Item>,
     /// With gradients.
     device: Device,
@@ -51,6 +53,7 @@ impl PointTask {
         Ok(Self {
             networks: config.networks(),
             losses: config.stage1.clone(),
+            seed: config.training.seed,
             data: Data::new(folders, config, &config.samples(), Stage1::new)?,
             device: device.clone(),
         })
@@ -98,6 +101,10 @@ impl Task for PointTask {
         at: Moment,
     ) -> Result<Vec<Part>, TrainError> {
         let batch = Stage1Batch::new(items, &self.device);
+        if self.losses.only_details {
+            let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
+            return Ok(details::losses(predictor, &self.networks, &batch, &at, (self.seed, self.losses.relief_weight)));
+        }
         let prediction = self.predict(networks, &batch, at.extent);
         let relief = self.losses.relief_weight > 0.0;
         Ok(losses(&prediction, &batch.points, &batch.valid, relief).parts(&self.losses))

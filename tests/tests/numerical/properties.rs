@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use snapsnap_base::config::Schema;
-use snapsnap_net::config::{Config, Downsample, NetworkConfig, Upsample};
+use snapsnap_net::config::{Config, Downsample, NetworkConfig};
 use snapsnap_net::network::{Decoded, Input, PointMap, View, activate};
 use snapsnap_net::resample::shrink;
 use snapsnap_net::steps::Step;
@@ -158,23 +158,23 @@ fn mask_aware_enlargement_never_blends_in_the_background() {
     let Some(device) = device() else { return };
     let net = weights(&config(&[]), 1).1.point_predictor(&device).expect("weights");
     let delta = values(net.delta())[0];
-    let row = |method: Upsample, background: f32| -> Vec<f32> {
+    let row = |is_aware: bool, background: f32| -> Vec<f32> {
         let points: Vec<f32> = [1.0, 2.0, background].iter().flat_map(|v| [*v; 3]).collect();
         let map = PointMap {
             points: Tensor::from_data(TensorData::new(points, [1, 1, 3, 3]), &device),
             conf: Tensor::zeros([1, 1, 3], &device),
         };
         let body = Tensor::from_data(TensorData::new(vec![1.0_f32, 1.0, 0.0], [1, 1, 1, 3]), &device);
-        let points = values(net.enlarged(map, 2, method, Some(body)).points);
+        let points = values(net.enlarged(map, 2, is_aware.then_some(body)).points);
         points.chunks_exact(3).take(6).map(|p| p[0] / delta).collect()
     };
     let close = |got: &[f32], expected: &[f32]| got.iter().zip(expected).all(|(g, e)| (g - e).abs() < 1e-3);
-    let plain = row(Upsample::Bilinear, 1000.0);
+    let plain = row(false, 1000.0);
     assert!(close(&plain, &[1.0, 1.25, 1.75, 251.5, 750.5, 1000.0]), "{plain:?}");
     // The fourth pixel is three quarters body, the fifth one quarter: both are the second body point.
-    let aware = row(Upsample::MaskAware, 1000.0);
+    let aware = row(true, 1000.0);
     assert!(close(&aware, &[1.0, 1.25, 1.75, 2.0, 2.0, 1000.0]), "{aware:?}");
-    let overflowed = row(Upsample::MaskAware, f32::INFINITY);
+    let overflowed = row(true, f32::INFINITY);
     assert!(close(&overflowed[..5], &aware[..5]), "{overflowed:?}");
 }
 

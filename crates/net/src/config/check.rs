@@ -3,7 +3,7 @@
 use snapsnap_base::config::{Removed, outside};
 
 use super::{
-    Anchor, Body, COLOR_LIMITS, Config, Downsample, HULL_REACH, HeadKind, LEAST_OPACITIES, OPPOSITE,
+    Anchor, Body, CELL, COLOR_LIMITS, Config, Downsample, HULL_REACH, HeadKind, LEAST_OPACITIES, OPPOSITE,
     RegressorStart, RotationFrame, Sides, Upsample, WorldFrame,
 };
 
@@ -52,7 +52,10 @@ impl Config {
         let (n, r) = (&self.network, &self.regressor);
         let branches = n.layer_dims.map(|dim| ("network.layer_dims", dim, 1..=8_192));
         let sides = n.side_dims.map(|dim| ("network.side_dims", dim, 1..=8_192));
+        let details = n.details.clone().unwrap_or_default();
+        let detail_dims = details.dims.map(|dim| ("network.details.dims", dim, 1..=8_192));
         let sizes = [
+            ("network.details.resolution", details.resolution, 1..=4_096),
             ("network.enc_dim", n.enc_dim, 1..=8_192),
             ("network.enc_depth", n.enc_depth, 1..=128),
             ("network.enc_heads", n.enc_heads, 1..=1_024),
@@ -76,7 +79,7 @@ impl Config {
             ("network.hull_reach", n.hull_reach, 0.0..=1.0),
             ("network.delta", n.delta, 1e-6..=1e6),
         ];
-        outside(sizes.into_iter().chain(branches).chain(sides))
+        outside(sizes.into_iter().chain(branches).chain(sides).chain(detail_dims))
             .or_else(|| outside(values.into_iter().chain(least).chain(limits)))
     }
 
@@ -101,6 +104,11 @@ impl Config {
         let is_enlarged = n.resolution.is_multiple_of(n.net_resolution) && n.resolution.is_multiple_of(4);
         // Both halves of an image have a whole number of pixels at every level.
         let is_halved = n.net_resolution.is_multiple_of(2 * n.patch);
+        let details = n.details.as_ref().map_or(n.net_resolution, |details| details.resolution);
+        // Windows are whole patches of the predictor's input.
+        let is_detailed = details.is_multiple_of(n.net_resolution)
+            && n.resolution.is_multiple_of(details)
+            && (n.patch * details / n.net_resolution).is_multiple_of(CELL);
         let problems = [
             (
                 "network.feature_dim",
@@ -132,6 +140,20 @@ impl Config {
                 "network.second_layer",
                 n.second_layer && !(is_completed && n.side_heads),
                 "needs `network.sides = \"completed\"` and `network.side_heads = true`".into(),
+            ),
+            ("network.details", n.details.is_some() && n.anchor != Anchor::Ray, "needs `network.anchor = \"ray\"`".into()),
+            (
+                "network.pair_degrees",
+                n.details.is_some() && is_oblique,
+                "must be 180 with `network.details`".into(),
+            ),
+            (
+                "network.details.resolution",
+                n.details.is_some() && !is_detailed,
+                format!(
+                    "is {details}, must be a multiple of `network.net_resolution` ({}) and divide `network.resolution` ({})",
+                    n.net_resolution, n.resolution
+                ),
             ),
             // The mirror image of the second photograph belongs to a camera at minus this angle.
             ("network.pair_degrees", is_oblique && n.side_heads, opposite("side_heads")),
@@ -203,6 +225,7 @@ impl Config {
             ("network.sides", self.network.sides == Sides::Predicted, "\"predicted\""),
             ("network.pair_degrees", self.network.pair_degrees == OPPOSITE, "180"),
             ("network.second_layer", !self.network.second_layer, "false"),
+            ("network.details", self.network.details.is_none(), "unset"),
             ("network.both_ways", !self.network.both_ways, "false"),
             ("network.on_rays", !self.network.on_rays, "false"),
             ("network.hull_margin", self.network.hull_margin.is_none(), "unset"),

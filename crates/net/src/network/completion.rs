@@ -62,11 +62,13 @@ impl Completion {
             outputs: if c.second_layer { 4 } else { 2 },
             widths,
             blocks: [c.dec_dim, c.dec_depth, c.dec_heads],
+            stride: c.stride(),
+            last_dim: c.last_dim,
         };
         Self {
             embed: conv1x1(c.last_dim, FEATURES, device),
             rows: widths.iter().zip(c.layer_dims).map(|(to, from)| conv1x1(2 * from, *to, device)).collect(),
-            body: UNet::new(c, &sizes, device),
+            body: UNet::new(&sizes, device),
             side: c.net_resolution,
             second_layer: c.second_layer,
         }

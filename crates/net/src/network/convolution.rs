@@ -30,6 +30,8 @@ impl PointUNet {
             outputs: 8,
             widths,
             blocks: [c.enc_dim, c.enc_depth, c.enc_heads],
+            stride: c.stride(),
+            last_dim: c.last_dim,
         };
         let attention = || {
             let blocks = [c.dec_depth, c.dec_heads];
@@ -37,7 +39,7 @@ impl PointUNet {
         };
         let has = |sides: Sides| c.side_heads && c.sides == sides;
         Self {
-            body: UNet::new(c, &sizes, device),
+            body: UNet::new(&sizes, device),
             side_attention: has(Sides::Predicted).then(attention),
             side_decoder: has(Sides::Predicted).then(|| Decoder::new(widths, c.last_dim, 8, device)),
             completion: has(Sides::Completed).then(|| Completion::new(c, device)),
@@ -88,7 +90,7 @@ impl PointUNet {
 
     /// Splits the channels of two views into two images of the input's size.
     fn pair(&self, x: Tensor<4>) -> [Tensor<4>; 2] {
-        let ([_, _, h, w], stride) = (x.dims(), self.config.patch >> (LEVELS - 1));
+        let ([_, _, h, w], stride) = (x.dims(), self.config.stride());
         let x = if stride > 1 { bilinear(x, [stride * h, stride * w], false) } else { x };
         let each = x.dims()[1] / 2;
         [x.clone().narrow(1, 0, each), x.narrow(1, each, each)]

@@ -5,6 +5,7 @@ mod attention;
 mod block;
 mod completion;
 mod convolution;
+mod details;
 mod dpt;
 mod dust3r;
 mod input;
@@ -19,6 +20,7 @@ use burn::tensor::Device;
 use snapsnap_ops::Rope;
 
 pub(crate) use dpt::{conv1x1, conv3x3};
+pub use details::SecondLook;
 pub use dust3r::TokenMaps;
 pub use input::Input;
 pub use predictor::{Decoded, Encoded, PointMap, PointPredictor, activate};

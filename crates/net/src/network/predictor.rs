@@ -6,9 +6,10 @@ use burn::tensor::{Device, Tensor};
 
 use super::completion::Photographed;
 use super::convolution::PointUNet;
+use super::details::{Details, SecondLook};
 use super::dust3r::{Dust3r, TokenMaps};
 use super::input::Input;
-use super::rays::{anchors, on_rays};
+use super::rays::{Rays, anchors, on_rays};
 use super::unet::Levels;
 use super::view::View;
 use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Sides, Upsample};
@@ -103,6 +104,35 @@ fn mean_with_mirrored(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
     maps.iter().map(mean).collect()
 }
 
+/// A map that is `factor` times larger. `weights` `[B, 1, H, W]` ≥ 0 are the person's share of each pixel, for
+/// `mask-aware` interpolation; without them points are interpolated across silhouettes.
+fn enlarged(map: PointMap, factor: usize, weights: Option<Tensor<4>>) -> PointMap {
+    if factor == 1 {
+        return map;
+    }
+    let [b, h, w, _] = map.points.dims();
+    let size = [h * factor, w * factor];
+    let up = |x: Tensor<4>| bilinear(x, size, false);
+    let points = map.points.permute([0, 3, 1, 2]);
+    let plain = up(points.clone());
+    let points = match weights {
+        Some(weights) => {
+            /// Canvas pixels with a smaller interpolated weight keep the plain interpolation.
+            const MIN_WEIGHT: f64 = 1e-4;
+            let total = up(weights.clone());
+            // Points of the background may be anything, an overflow included.
+            let background = weights.clone().lower_equal_elem(0.0).expand(points.dims());
+            let weighted = (points * weights).mask_fill(background, 0.0);
+            let inside = up(weighted) / total.clone().clamp_min(MIN_WEIGHT);
+            let outside = total.lower_elem(MIN_WEIGHT).expand(plain.dims());
+            inside.mask_where(outside, plain)
+        }
+        None => plain,
+    };
+    let conf = up(map.conf.reshape([b, 1, h, w])).reshape([b, size[0], size[1]]);
+    PointMap { points: points.permute([0, 2, 3, 1]), conf }
+}
+
 /// Output of the encoder.
 #[derive(Debug, Clone)]
 pub enum Encoded {
@@ -136,6 +166,7 @@ pub struct PointPredictor {
     /// δ `[1]`: metres per network unit.
     scale: Param<Tensor<1>>,
     pub(super) body: Body,
+    details: Option<Details>,
     #[module(skip)]
     config: NetworkConfig,
 }
@@ -148,7 +179,8 @@ impl PointPredictor {
             config::Body::Transformer => Body::Transformer(Dust3r::new(config, device)),
             config::Body::Convolution => Body::Convolution(PointUNet::new(config, device)),
         };
-        Self { scale, body, config: config.clone() }
+        let details = config.details.as_ref().map(|details| Details::new(details, device));
+        Self { scale, body, details, config: config.clone() }
     }
 
     /// The same network without the layers of the unseen sides.
@@ -178,6 +210,11 @@ impl PointPredictor {
         self.views().len() > 2 && self.config.sides == Sides::Predicted
     }
 
+    /// Whether a second network refines the photographs' points.
+    pub fn has_details(&self) -> bool {
+        self.details.is_some()
+    }
+
     /// Whether the layer of this name in a checkpoint outputs the raw points.
     pub(crate) fn is_last_layer(&self) -> fn(&str) -> bool {
         match &self.body {
@@ -196,39 +233,11 @@ impl PointPredictor {
         x.clone() * self.delta().reshape([1; 4]).expand(x.dims())
     }
 
-    /// Enlarges a map `factor` times, from network pixels to canvas pixels, and multiplies its points by δ
-    /// (docs/method.md, "Enlargement and delta").
-    ///
-    /// `weights` `[B, 1, H, W]` ≥ 0 are the person's share of each network pixel, for `mask-aware` interpolation.
-    pub fn enlarged(
-        &self,
-        map: PointMap,
-        factor: usize,
-        method: Upsample,
-        weights: Option<Tensor<4>>,
-    ) -> PointMap {
-        let [b, h, w, _] = map.points.dims();
-        let size = [h * factor, w * factor];
-        let up = |x: Tensor<4>| if factor == 1 { x } else { bilinear(x, size, false) };
-        let points = map.points.permute([0, 3, 1, 2]);
-        let plain = up(points.clone());
-        let points = match (method, weights) {
-            (Upsample::MaskAware, Some(weights)) if factor > 1 => {
-                /// Canvas pixels with a smaller interpolated weight keep the plain interpolation.
-                const MIN_WEIGHT: f64 = 1e-4;
-                let total = up(weights.clone());
-                // Points of the background may be anything, an overflow included.
-                let background = weights.clone().lower_equal_elem(0.0).expand(points.dims());
-                let weighted = (points * weights).mask_fill(background, 0.0);
-                let inside = up(weighted) / total.clone().clamp_min(MIN_WEIGHT);
-                let outside = total.lower_elem(MIN_WEIGHT).expand(plain.dims());
-                inside.mask_where(outside, plain)
-            }
-            _ => plain,
-        };
-        let points = self.times_delta(points.permute([0, 2, 3, 1]));
-        let conf = up(map.conf.reshape([b, 1, h, w])).reshape([b, size[0], size[1]]);
-        PointMap { points, conf }
+    /// Enlarges a map from network pixels to canvas pixels, and multiplies its points by δ (docs/method.md,
+    /// "Enlargement and delta"). `weights` are as for [`enlarged`].
+    pub fn enlarged(&self, map: PointMap, factor: usize, weights: Option<Tensor<4>>) -> PointMap {
+        let PointMap { points, conf } = enlarged(map, factor, weights);
+        PointMap { points: self.times_delta(points), conf }
     }
 
     /// Adds the anchors of a window to a view's map: corrections in metres become points in the front camera's frame.
@@ -245,9 +254,9 @@ impl PointPredictor {
         }
     }
 
-    /// Enlarges a head's map to the canvas pixels of the `window` that the network received, and adds the anchors.
-    /// Points are then metres in the front camera's frame. `mask` `[B, 1, S, S]` is the photograph's mask. Sides have
-    /// no mask: their person is where the predicted confidence exceeds the threshold, without a gradient.
+    /// Enlarges a map to the canvas pixels of the `window` that the network received, and adds the anchors. Points are
+    /// then metres in the front camera's frame. `mask` `[B, 1, S, S]` is the photograph's mask. Sides have no mask:
+    /// their person is where the predicted confidence exceeds the threshold, without a gradient.
     pub fn finished(
         &self,
         config: &Config,
@@ -256,15 +265,80 @@ impl PointPredictor {
         window: &Window,
         mask: Option<&Tensor<4>>,
     ) -> PointMap {
-        let (method, factor) = (config.upsample(), config.upsample_factor());
-        let weights = (method == Upsample::MaskAware && factor > 1).then(|| match mask {
+        let factor = window.rows.len() / map.conf.dims()[1];
+        let is_weighted = config.upsample() == Upsample::MaskAware && factor > 1;
+        let weights = is_weighted.then(|| match mask {
             Some(mask) => shrink(window.cut(mask.clone()), factor, Downsample::Area),
             None => {
                 let person = map.conf.clone().detach().greater_elem(config.network.conf_threshold);
                 person.float().unsqueeze_dim(1)
             }
         });
-        self.add_anchors(view, self.enlarged(map, factor, method, weights), window)
+        self.add_anchors(view, self.enlarged(map, factor, weights), window)
+    }
+
+    /// Refines the maps of front and back, in network units and without anchors (docs/method.md, "Details"). Returns
+    /// maps of `network.details.resolution`, and moves the given maps by the mean movement of the person in each pixel.
+    /// `images` `[B, 2, 3, S, S]` and `masks` `[B, 2, S, S]` are the photographs. Without a network of details there are
+    /// no maps.
+    pub fn detailed(
+        &self,
+        maps: &mut [(View, PointMap)],
+        images: &Tensor<5>,
+        masks: &Tensor<4>,
+        window: &Window,
+    ) -> Vec<(View, PointMap)> {
+        let Some(details) = &self.details else { return Vec::new() };
+        let [canvas, coarse] = [self.config.resolution, self.config.net_resolution];
+        let fine = details.resolution;
+        let look = self.second_look(maps, images, masks, window);
+        let relief = self.relief(look.images);
+        let b = relief.dims()[0] / 2;
+        let reliefs = [0, b].map(|from| relief.clone().narrow(0, from, b));
+        let moved = |view: View, map: PointMap, relief: Tensor<4>, side: usize| {
+            let place = window.shrunk(canvas / side);
+            let directions = Rays::new(view, config::OPPOSITE, side, &place, &relief.device()).directions;
+            PointMap { points: map.points + directions * relief.permute([0, 2, 3, 1]), ..map }
+        };
+        for (i, (view, map)) in maps.iter_mut().take(2).enumerate() {
+            /// Least share of the person in a pixel that is moved.
+            const MIN_SHARE: f64 = 1e-3;
+            let small = |x: Tensor<4>| shrink(x, fine / coarse, Downsample::Area);
+            let mask = look.masks[i].clone();
+            let mean = small(reliefs[i].clone() * mask.clone()) / small(mask).clamp_min(MIN_SHARE);
+            *map = moved(*view, map.clone(), mean, coarse);
+        }
+        let views = [View::Front, View::Back].into_iter().zip(look.maps).zip(reliefs);
+        views.map(|((view, map), relief)| (view, moved(view, map, relief, fine))).collect()
+    }
+
+    /// Input of the network of details for maps of front and back, as in [`Self::detailed`].
+    ///
+    /// # Panics
+    /// Without such a network.
+    pub fn second_look(
+        &self,
+        maps: &[(View, PointMap)],
+        images: &Tensor<5>,
+        masks: &Tensor<4>,
+        window: &Window,
+    ) -> SecondLook {
+        let fine = self.details.as_ref().expect("a network of details").resolution;
+        let [canvas, coarse] = [self.config.resolution, self.config.net_resolution];
+        let small = |x: Tensor<4>, size: usize| shrink(window.cut(x), canvas / size, Downsample::Area);
+        let mask = |view: usize, size: usize| small(masks.clone().narrow(1, view, 1), size);
+        let colors = [0, 1].map(|view| small(images.clone().narrow(1, view, 1).squeeze_dim(1), fine));
+        let larger = |view: usize| enlarged(maps[view].1.clone(), fine / coarse, Some(mask(view, coarse)));
+        SecondLook::new([larger(0), larger(1)], colors, [mask(0, fine), mask(1, fine)], &window.shrunk(canvas / fine), fine)
+    }
+
+    /// Movements along the rays `[N, 1, h, w]`, in network units, for images of a [`SecondLook`] or for parts of them.
+    /// A movement of 1 changes the depth by one unit.
+    ///
+    /// # Panics
+    /// Without a network of details.
+    pub fn relief(&self, images: Tensor<4>) -> Tensor<4> {
+        self.details.as_ref().expect("a network of details").relief(images)
     }
 
     /// The encoder: a transformer reads each photograph alone, a convolution both together.

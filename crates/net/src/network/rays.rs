@@ -79,13 +79,17 @@ impl Rays {
             forward,
         }
     }
+
+    /// Where the rays meet the plane through the body's axis: `[1, h, w, 3]` metres, front camera's frame.
+    pub(super) fn anchors(&self) -> Tensor<4> {
+        self.directions.clone() * self.depths.clone() + self.centre.clone()
+    }
 }
 
 /// The anchors of a view's pixels in a window of a canvas of `side`² pixels, `[1, h, w, 3]` metres, front camera's
 /// frame. The second photograph was taken `pair_degrees` around the person from the first.
 pub fn anchors(view: View, pair_degrees: f64, side: usize, window: &Window, device: &Device) -> Tensor<4> {
-    let Rays { directions, depths, centre, .. } = Rays::new(view, pair_degrees, side, window, device);
-    directions * depths + centre
+    Rays::new(view, pair_degrees, side, window, device).anchors()
 }
 
 /// Moves points `[B, h, w, 3]` of a photograph's `window` of a canvas of `side`² pixels, metres in the front camera's

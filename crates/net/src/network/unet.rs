@@ -9,7 +9,6 @@ use burn::tensor::{Device, Tensor};
 use super::block::{EncoderBlock, layer_norm, normalise};
 use super::dpt::{ResidualConvUnit, conv1x1, conv3x3};
 use super::rope;
-use crate::config::NetworkConfig;
 use snapsnap_ops::layers::{conv2d, linear};
 use snapsnap_ops::{Rope, as_weight, bilinear};
 
@@ -124,20 +123,22 @@ pub(super) struct UNetSizes {
     pub widths: [usize; LEVELS],
     /// Channels, number and heads of the attention's blocks.
     pub blocks: [usize; 3],
+    /// Pixels of the input per finest pixel, along an axis.
+    pub stride: usize,
+    /// Channels of the features.
+    pub last_dim: usize,
 }
 
 impl UNet {
-    pub(super) fn new(config: &NetworkConfig, sizes: &UNetSizes, device: &Device) -> Self {
-        let UNetSizes { inputs, outputs, widths, blocks: [dim, depth, heads] } = *sizes;
+    pub(super) fn new(sizes: &UNetSizes, device: &Device) -> Self {
+        let UNetSizes { inputs, outputs, widths, blocks: [dim, depth, heads], stride, last_dim } = *sizes;
         let coarsest = widths[LEVELS - 1];
-        // Pixels of the input per finest pixel, along an axis.
-        let stride = config.patch >> (LEVELS - 1);
         Self {
             conv_in: conv3x3(inputs, widths[0], stride, true, device),
             units: widths.iter().map(|width| ResidualConvUnit::new(*width, device)).collect(),
             down: widths.windows(2).map(|pair| conv3x3(pair[0], pair[1], 2, true, device)).collect(),
             attention: Attention::new([coarsest, dim, coarsest], [depth, heads], device),
-            decoder: Decoder::new(widths, config.last_dim, outputs, device),
+            decoder: Decoder::new(widths, last_dim, outputs, device),
             head_dim: dim / heads,
         }
     }

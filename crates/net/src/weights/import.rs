@@ -8,7 +8,7 @@ use std::slice;
 use super::WeightsError;
 use super::file::{Progress, WeightFile, mismatch, parts_of, write, write_tensors};
 use super::init::{SideHeads, draw};
-use super::schema::{self, DUST3R, Part, SCALE, SIDE, TensorSpec, UNET};
+use super::schema::{self, DETAILS, DUST3R, Part, SCALE, SIDE, TensorSpec, UNET};
 use super::source::{CONFIG_KEY, Source};
 use crate::config::{Config, Precision};
 
@@ -81,7 +81,7 @@ fn alias_of(name: &str) -> Option<String> {
 /// The name in a weight file for a key of the authors' files: prefix added, alias replaced.
 fn canonical(key: &str) -> String {
     let bare = key.strip_prefix(DUST3R).unwrap_or(key);
-    if bare == SCALE || ["pred_unet.", "gs_conv.", SIDE, UNET].iter().any(|p| bare.starts_with(p)) {
+    if bare == SCALE || ["pred_unet.", "gs_conv.", SIDE, UNET, DETAILS].iter().any(|p| bare.starts_with(p)) {
         return bare.to_owned();
     }
     if let Some((head, tail)) = bare.split_once("scratch.layer_rn.")

@@ -54,6 +54,8 @@ pub const SCALE: &str = "scale";
 pub const DUST3R: &str = "dust3r.";
 /// Prefix of the convolutional network's keys.
 pub const UNET: &str = "unet.";
+/// Prefix of the keys of the network of details.
+pub const DETAILS: &str = "details.";
 /// Prefix of the second regressor's keys (`regressor.networks = 2`), which receives the side views.
 pub const SIDE: &str = "side.";
 

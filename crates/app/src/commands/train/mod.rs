@@ -134,7 +134,8 @@ fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
             Some(path) => open(path, &plan.config, &[Part::PointPredictor])?.point_predictor(tracked)?,
             None => random_predictor(&networks, plan.config.training.seed, tracked),
         };
-        Ok(Networks { predictor: Some(predictor), regressors: Vec::new() })
+        let networks = Networks { predictor: Some(predictor), regressors: Vec::new() };
+        Ok(if plan.config.stage1.only_details { networks.with_trained_details() } else { networks })
     })
 }
 
