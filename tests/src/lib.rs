@@ -293,6 +293,11 @@ impl Numbers {
         Self(fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display())))
     }
 
+    /// Names of all tensors.
+    pub fn names(&self) -> Vec<String> {
+        self.file().names().into_iter().map(str::to_owned).collect()
+    }
+
     /// Whether there is a tensor of this name.
     pub fn has(&self, name: &str) -> bool {
         self.file().tensor(name).is_ok()

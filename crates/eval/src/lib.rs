@@ -7,6 +7,7 @@ pub mod evaluate;
 pub mod foreign;
 pub mod geometry;
 pub mod lpips;
+pub mod parts;
 pub mod pictures;
 pub mod points;
 pub mod preview;

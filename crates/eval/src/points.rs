@@ -85,7 +85,7 @@ pub fn normal_error(pair: &Pair, side: usize) -> Option<f64> {
 }
 
 /// Whether a pixel has a prediction. Pixels outside the predictor's window have the point 0, where the camera stands.
-fn is_predicted(point: &[f32; 3]) -> bool {
+pub(crate) fn is_predicted(point: &[f32; 3]) -> bool {
     point.iter().all(|v| v.is_finite()) && point.iter().any(|v| *v != 0.0)
 }
 

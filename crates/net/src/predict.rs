@@ -75,8 +75,8 @@ impl Prediction {
             fine = record.timed("details", |_| predictor.detailed(&mut maps, &images, masks, &window));
         }
         if maps.len() < predictor.views().len() {
-            maps =
-                record.timed("completed sides", |_| predictor.complete(maps, &decoded, &input_images, &window));
+            maps = record
+                .timed("completed sides", |_| predictor.complete(maps, &decoded, &input_images, &window));
         }
         maps.splice(..fine.len(), fine);
         let finished = |(view, map): (View, PointMap)| {

@@ -164,6 +164,21 @@ pub fn cut_out(source: Source, cutting: Cutting) -> Result<Figure, FileError> {
     Ok(Figure { rgb: cutout.rgb, mask: cutout.mask, joints, signs })
 }
 
+/// The person's 33 joints on a canvas, in its pixels; none if nobody is recognised.
+pub fn joints_on(canvas: &Photograph) -> Vec<Joint> {
+    let side = canvas.mask.len().isqrt() as u32;
+    let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0).round() as u8;
+    let area = canvas.mask.len();
+    // A canvas is grey outside of the person.
+    let color = |i: usize| [0, 1, 2].map(|c| byte(0.5 * canvas.rgb[c * area + i] + 0.5));
+    let at = |x: u32, y: u32| (y * side + x) as usize;
+    let rgb = RgbImage::from_fn(side, side, |x, y| Rgb(color(at(x, y))));
+    let mask = GrayImage::from_fn(side, side, |x, y| image::Luma([byte(canvas.mask[at(x, y)])]));
+    let person = Rect::around(&mask, INSIDE);
+    let look = person.and_then(|person| look::Look::at(&rgb, &mask, person, &segmenter::pose));
+    look.map_or_else(Vec::new, |look| look.joints.0)
+}
+
 /// A channel in [0, 1].
 fn unit(value: u8) -> f32 {
     f32::from(value) / 255.0

@@ -1,8 +1,9 @@
 //! Stage 1 of the network of details alone: it learns from small windows of the photographs, most of them where the
 //! coarse points lack a relief (docs/method.md, "Losses of stage 1").
 
-use burn::tensor::Tensor;
+use burn::tensor::{Tensor, TensorData};
 use rand::Rng;
+use rayon::prelude::*;
 use snapsnap_base::random::stream;
 use snapsnap_data::sample::Stage1Batch;
 use snapsnap_net::Window;
@@ -15,11 +16,18 @@ use crate::points::offsets;
 use crate::task::{Moment, Part};
 
 /// Windows of each photograph.
-const WINDOWS: usize = 3;
+const WINDOWS: usize = 5;
 /// Side of a window, in pixels of the network of details. At 512 pixels this is 44 cm.
 const SIDE: usize = 96;
 /// Side of the cells whose relief is measured.
 const CELL: usize = 8;
+/// Distances in pixels between which the relief is compared.
+const SPACINGS: [usize; 4] = [1, 2, 4, 8];
+/// Standard deviation in pixels of the smoothing whose result is no detail: 7 cm at 512 pixels. Whether a whole limb is
+/// too near can hardly be seen, and errors of this kind hide the smaller ones.
+const SMOOTH: f32 = 15.0;
+/// Part of the person's height that counts as the head, and how many times more often its cells are drawn.
+const HEAD: (f32, f32) = (0.125, 8.0);
 /// Relief of a cell in metres above which windows are not drawn more often: a step between two limbs.
 const MOST: f32 = 0.01;
 /// Relief in metres that is added to a cell's own, so that windows show plain surfaces as well.
@@ -50,10 +58,12 @@ pub fn losses(
         (sum / shares[view].clone().clamp_min(1e-3)).permute([0, 2, 3, 1])
     });
     let delta = host(predictor.delta())[0];
-    let behind = look.depths_behind(points, delta);
     let inside = Tensor::cat(shares.to_vec(), 0).greater_equal_elem(0.5).float();
+    let (behind, there) = (host(look.depths_behind(points, delta)), host(inside.clone()));
+    let images = behind.par_chunks_exact(h * w).zip(there.par_chunks_exact(h * w));
+    let on_host = images.map(|(behind, there)| details(behind, there, w)).collect::<Vec<_>>().concat();
+    let behind = Tensor::from_data(TensorData::new(on_host.clone(), [2 * b, 1, h, w]), &inside.device());
 
-    let (on_host, there) = (host(behind.clone()), host(inside.clone()));
     let mut random = stream(&format!("details/{seed}/{}/{}", at.step, at.first));
     let mut places = Vec::new();
     for (image, (behind, there)) in on_host.chunks_exact(h * w).zip(there.chunks_exact(h * w)).enumerate() {
@@ -86,7 +96,11 @@ pub fn losses(
     let (images, behind, inside) = (windows(&look.images), windows(&behind), windows(&inside));
     let off = (predictor.relief(images) * delta - behind).permute([0, 2, 3, 1]);
     let zeros = off.zeros_like();
-    let lengths = mean_lengths(Tensor::cat(vec![off, zeros.clone(), zeros], 3), inside.squeeze_dim(1), &offsets(rows, columns));
+    let lengths = mean_lengths(
+        Tensor::cat(vec![off, zeros.clone(), zeros], 3),
+        inside.squeeze_dim(1),
+        &offsets(rows, columns, &SPACINGS),
+    );
     let differences = lengths.dims()[1] - 1;
     vec![
         Part { name: "points", weight: 1.0, value: lengths.clone().narrow(1, 0, 1).mean() },
@@ -94,11 +108,43 @@ pub fn losses(
     ]
 }
 
+/// Depths minus their mean over the person's pixels nearby, with the weights of a Gaussian of [`SMOOTH`] pixels; 0 outside
+/// of the person.
+fn details(depths: &[f32], there: &[f32], w: usize) -> Vec<f32> {
+    let reach = (3.0 * SMOOTH) as isize;
+    let weights: Vec<f32> = (-reach..=reach).map(|i| (-0.5 * (i as f32 / SMOOTH).powi(2)).exp()).collect();
+    // Along rows and then, since rows become columns, along columns.
+    let smooth = |image: &[[f32; 2]], w: usize| {
+        let h = image.len() / w;
+        let mut turned = vec![[0.0; 2]; image.len()];
+        for (row, line) in image.chunks_exact(w).enumerate() {
+            for column in 0..w {
+                let mut sum = [0.0; 2];
+                for (offset, weight) in (-reach..=reach).zip(&weights) {
+                    if let Some(value) = column.checked_add_signed(offset).and_then(|at| line.get(at)) {
+                        sum = [sum[0] + weight * value[0], sum[1] + weight * value[1]];
+                    }
+                }
+                turned[column * h + row] = sum;
+            }
+        }
+        turned
+    };
+    let inside = |(depth, share): (&f32, &f32)| if *share > 0.5 { [*depth, 1.0] } else { [0.0; 2] };
+    let image: Vec<[f32; 2]> = depths.iter().zip(there).map(inside).collect();
+    let smoothed = smooth(&smooth(&image, w), image.len() / w);
+    let off = image.iter().zip(smoothed).map(|(own, mean)| own[1] * (own[0] - mean[0] / mean[1].max(1e-6)));
+    off.collect()
+}
+
 /// The middle of each cell of [`CELL`]² pixels that shows the person, and the mean deviation of its depths from their
-/// mean, limited to `LEAST..MOST + LEAST`.
+/// mean, limited to `LEAST..MOST + LEAST`; for cells of the head more.
 fn cells(behind: &[f32], there: &[f32], w: usize) -> Vec<([usize; 2], f32)> {
     let h = there.len() / w;
     let mut found = Vec::new();
+    let mut rows = (0..h).filter(|row| there[row * w..(row + 1) * w].iter().any(|share| *share > 0.5));
+    let (Some(top), bottom) = (rows.next(), rows.next_back().unwrap_or(0)) else { return found };
+    let chin = top + (HEAD.0 * bottom.saturating_sub(top) as f32) as usize;
     for row in (0..h).step_by(CELL) {
         for column in (0..w).step_by(CELL) {
             let rows = row..(row + CELL).min(h);
@@ -110,7 +156,8 @@ fn cells(behind: &[f32], there: &[f32], w: usize) -> Vec<([usize; 2], f32)> {
             let mean = depths.iter().sum::<f32>() / depths.len() as f32;
             let relief = depths.iter().map(|depth| (depth - mean).abs()).sum::<f32>() / depths.len() as f32;
             if relief.is_finite() {
-                found.push(([row + CELL / 2, column + CELL / 2], relief.min(MOST) + LEAST));
+                let times = if row < chin { HEAD.1 } else { 1.0 };
+                found.push(([row + CELL / 2, column + CELL / 2], times * (relief.min(MOST) + LEAST)));
             }
         }
     }

@@ -38,7 +38,11 @@ impl Networks {
     pub fn with_trained_details(self) -> Self {
         struct Freeze;
         impl NamedMapper for Freeze {
-            fn map<const D: usize>(&mut self, path: &ParameterPath, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            fn map<const D: usize>(
+                &mut self,
+                path: &ParameterPath,
+                param: Param<Tensor<D>>,
+            ) -> Param<Tensor<D>> {
                 param.set_require_grad(path.name().starts_with(DETAILS))
             }
         }

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use snapsnap_tests::{refused, snapsnap, succeed};
+use snapsnap_tests::{Numbers, refused, snapsnap, succeed};
 
 use super::{logged, people, place, train};
 
@@ -76,6 +76,33 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     command.arg("reconstruct").arg(view(0)).arg(view(2)).args(["--as-is", "--device", "cpu", "--weights"]);
     succeed(command.arg(two.join("last.safetensors")).arg("-o").arg(&ply));
     assert!(fs::metadata(&ply).expect("a file").len() > 10_000);
+}
+
+/// All other layers keep the values that the run begins with.
+#[test]
+fn details_are_trained_alone() {
+    let (temporary, config) = place();
+    let [start, run] = ["start.safetensors", "run"].map(|name| temporary.path().join(name));
+    let details = ["network.anchor=ray", "network.details.resolution=64", "network.details.dims=[4,4,8,8]"];
+    let set = || details.iter().flat_map(|key| ["--set", key]);
+    succeed(snapsnap().arg("init-weights").arg("--config").arg(&config).args(set()).arg("-o").arg(&start));
+    let only = ["--set=stage1.only_details=true", "--set=training.steps=3", "--set=schedule.warm_up=0"];
+    succeed(train(1, &config, &run).args(set()).args(only).arg("--weights").arg(&start));
+    let [start, end] = [start, run.join("last.safetensors")].map(|path| Numbers::read(&path));
+    let (mut moved, mut kept) = (0, 0);
+    for name in end.names() {
+        match name.starts_with("details.") {
+            true => moved += u32::from(start.f32(&name) != end.f32(&name)),
+            false => {
+                assert_eq!(start.f32(&name), end.f32(&name), "{name}");
+                kept += 1;
+            }
+        }
+    }
+    assert!(moved > 40 && kept > 40, "{moved} {kept}");
+    let without = ["--set=stage1.only_details=true"];
+    let said = refused(train(1, &config, &temporary.path().join("without")).args(without));
+    assert!(said.contains("`stage1.only_details`") && said.contains("`network.details`"), "{said}");
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::time::Duration;
 use burn::tensor::Device;
 use snapsnap_data::sample::{PhotographChanges, TestItem};
 use snapsnap_net::Photograph;
+use snapsnap_photo::joints_on;
 use snapsnap_splat::{Camera, Gaussians};
 
 use super::baselines::{MeanPictures, billboard, true_points};
@@ -17,6 +18,7 @@ use super::surface::Truth;
 use crate::EvalError;
 use crate::foreign::Palette;
 use crate::geometry::{ALIGNED, Align, double, icp, opaque_centres, thinned};
+use crate::parts::{PartError, part_errors};
 use crate::pictures::Picture;
 use crate::points::{Pair, PointError, point_errors};
 
@@ -47,12 +49,15 @@ pub enum Contestant {
     Mean(MeanPictures),
 }
 
+/// Errors of a person's points in each view, and on the parts of the photographs.
+pub type PointErrors = (Vec<PointError>, Vec<PartError>);
+
 /// A contestant's result for a person.
 pub struct Shown {
     /// World frame; `None` for pictures alone.
     pub gaussians: Option<Gaussians>,
     /// Errors of the predicted points, or why they could not be measured.
-    pub points: Result<Vec<PointError>, String>,
+    pub points: Result<PointErrors, String>,
     /// Number of pixels and Gaussians that were not finite.
     pub lost: usize,
     /// Mean overlap of the cut-outs and the true masks, if the networks cut the person out.
@@ -97,7 +102,7 @@ impl Contestant {
     ) -> Result<Shown, EvalError> {
         let of = |gaussians| Shown {
             gaussians,
-            points: Ok(Vec::new()),
+            points: Ok(PointErrors::default()),
             lost: 0,
             masks: None,
             palette: None,
@@ -227,13 +232,13 @@ fn errors(
     inputs: &[usize],
     maps: &[(usize, Vec<f32>)],
     side: usize,
-) -> Result<Vec<PointError>, EvalError> {
+) -> Result<PointErrors, EvalError> {
     // Pairs of more than two photographs have no common frame.
     if maps.is_empty() {
-        return Ok(Vec::new());
+        return Ok(PointErrors::default());
     }
     let Some((photographed, there)) = points(&people.test, row, inputs, item.side, side)? else {
-        return Ok(Vec::new());
+        return Ok(PointErrors::default());
     };
     let of_inputs = photographed.chunks_exact(3 * side * side).zip(there.chunks_exact(side * side));
     let mut truths: Vec<Points> =
@@ -243,7 +248,13 @@ fn errors(
     }
     let with_truth = maps.iter().filter_map(|(view, points)| Some((*view, points, truths.get(*view)?)));
     let pairs = with_truth.map(|(view, points, (truth, valid))| Pair { view, points, truth, valid });
-    Ok(point_errors(&pairs.collect::<Vec<_>>()))
+    let pairs: Vec<Pair> = pairs.collect();
+    let photographed = pairs.iter().filter(|pair| pair.view < 2);
+    let parts = photographed.flat_map(|pair| {
+        let joints = joints_on(&photograph(item, pair.view, side));
+        if joints.is_empty() { Vec::new() } else { part_errors(pair, &joints, side) }
+    });
+    Ok((point_errors(&pairs), parts.collect()))
 }
 
 #[cfg(test)]

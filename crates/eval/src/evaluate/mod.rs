@@ -22,6 +22,7 @@ use crate::EvalError;
 use crate::foreign::Traces;
 use crate::geometry::Align;
 use crate::lpips::Lpips;
+use crate::parts::PartError;
 use crate::pictures::Picture;
 use crate::points::PointError;
 use crate::preview::{grid, heat, picture};
@@ -64,6 +65,8 @@ pub struct Judged {
     pub rows: Vec<Row>,
     /// Errors of the predicted points, of all people and turns.
     pub points: Vec<PointError>,
+    /// Errors of the photographs' points on head, hands and feet, of all people and turns.
+    pub parts: Vec<PartError>,
     /// The Gaussians as a surface, per person and turn.
     pub surface: Vec<(usize, Surface)>,
     /// The mesh made of the Gaussians, per person and turn.
@@ -236,7 +239,10 @@ impl Place<'_> {
             self.left_out(outcome, &name, why);
         }
         let judged = &mut outcome.judged[i];
-        judged.points.extend(points.into_iter().flatten());
+        if let Some((points, parts)) = points {
+            judged.points.extend(points);
+            judged.parts.extend(parts);
+        }
         judged.masks.extend(made.masks.map(|overlap| (person, overlap)));
         judged.times.extend(made.time);
         judged.gaussians.extend(made.gaussians.as_ref().map(Gaussians::len));

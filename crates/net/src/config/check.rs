@@ -141,7 +141,11 @@ impl Config {
                 n.second_layer && !(is_completed && n.side_heads),
                 "needs `network.sides = \"completed\"` and `network.side_heads = true`".into(),
             ),
-            ("network.details", n.details.is_some() && n.anchor != Anchor::Ray, "needs `network.anchor = \"ray\"`".into()),
+            (
+                "network.details",
+                n.details.is_some() && n.anchor != Anchor::Ray,
+                "needs `network.anchor = \"ray\"`".into(),
+            ),
             (
                 "network.pair_degrees",
                 n.details.is_some() && is_oblique,

@@ -19,8 +19,8 @@ mod view;
 use burn::tensor::Device;
 use snapsnap_ops::Rope;
 
-pub(crate) use dpt::{conv1x1, conv3x3};
 pub use details::SecondLook;
+pub(crate) use dpt::{conv1x1, conv3x3};
 pub use dust3r::TokenMaps;
 pub use input::Input;
 pub use predictor::{Decoded, Encoded, PointMap, PointPredictor, activate};

@@ -6,10 +6,10 @@ use burn::tensor::{Device, Tensor};
 
 use super::completion::Photographed;
 use super::convolution::PointUNet;
-use super::details::{Details, SecondLook};
+use super::details::Details;
 use super::dust3r::{Dust3r, TokenMaps};
 use super::input::Input;
-use super::rays::{Rays, anchors, on_rays};
+use super::rays::{anchors, on_rays};
 use super::unet::Levels;
 use super::view::View;
 use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Sides, Upsample};
@@ -106,7 +106,7 @@ fn mean_with_mirrored(maps: &[(View, PointMap)]) -> Vec<(View, PointMap)> {
 
 /// A map that is `factor` times larger. `weights` `[B, 1, H, W]` ≥ 0 are the person's share of each pixel, for
 /// `mask-aware` interpolation; without them points are interpolated across silhouettes.
-fn enlarged(map: PointMap, factor: usize, weights: Option<Tensor<4>>) -> PointMap {
+pub(super) fn enlarged(map: PointMap, factor: usize, weights: Option<Tensor<4>>) -> PointMap {
     if factor == 1 {
         return map;
     }
@@ -166,9 +166,9 @@ pub struct PointPredictor {
     /// δ `[1]`: metres per network unit.
     scale: Param<Tensor<1>>,
     pub(super) body: Body,
-    details: Option<Details>,
+    pub(super) details: Option<Details>,
     #[module(skip)]
-    config: NetworkConfig,
+    pub(super) config: NetworkConfig,
 }
 
 impl PointPredictor {
@@ -275,70 +275,6 @@ impl PointPredictor {
             }
         });
         self.add_anchors(view, self.enlarged(map, factor, weights), window)
-    }
-
-    /// Refines the maps of front and back, in network units and without anchors (docs/method.md, "Details"). Returns
-    /// maps of `network.details.resolution`, and moves the given maps by the mean movement of the person in each pixel.
-    /// `images` `[B, 2, 3, S, S]` and `masks` `[B, 2, S, S]` are the photographs. Without a network of details there are
-    /// no maps.
-    pub fn detailed(
-        &self,
-        maps: &mut [(View, PointMap)],
-        images: &Tensor<5>,
-        masks: &Tensor<4>,
-        window: &Window,
-    ) -> Vec<(View, PointMap)> {
-        let Some(details) = &self.details else { return Vec::new() };
-        let [canvas, coarse] = [self.config.resolution, self.config.net_resolution];
-        let fine = details.resolution;
-        let look = self.second_look(maps, images, masks, window);
-        let relief = self.relief(look.images);
-        let b = relief.dims()[0] / 2;
-        let reliefs = [0, b].map(|from| relief.clone().narrow(0, from, b));
-        let moved = |view: View, map: PointMap, relief: Tensor<4>, side: usize| {
-            let place = window.shrunk(canvas / side);
-            let directions = Rays::new(view, config::OPPOSITE, side, &place, &relief.device()).directions;
-            PointMap { points: map.points + directions * relief.permute([0, 2, 3, 1]), ..map }
-        };
-        for (i, (view, map)) in maps.iter_mut().take(2).enumerate() {
-            /// Least share of the person in a pixel that is moved.
-            const MIN_SHARE: f64 = 1e-3;
-            let small = |x: Tensor<4>| shrink(x, fine / coarse, Downsample::Area);
-            let mask = look.masks[i].clone();
-            let mean = small(reliefs[i].clone() * mask.clone()) / small(mask).clamp_min(MIN_SHARE);
-            *map = moved(*view, map.clone(), mean, coarse);
-        }
-        let views = [View::Front, View::Back].into_iter().zip(look.maps).zip(reliefs);
-        views.map(|((view, map), relief)| (view, moved(view, map, relief, fine))).collect()
-    }
-
-    /// Input of the network of details for maps of front and back, as in [`Self::detailed`].
-    ///
-    /// # Panics
-    /// Without such a network.
-    pub fn second_look(
-        &self,
-        maps: &[(View, PointMap)],
-        images: &Tensor<5>,
-        masks: &Tensor<4>,
-        window: &Window,
-    ) -> SecondLook {
-        let fine = self.details.as_ref().expect("a network of details").resolution;
-        let [canvas, coarse] = [self.config.resolution, self.config.net_resolution];
-        let small = |x: Tensor<4>, size: usize| shrink(window.cut(x), canvas / size, Downsample::Area);
-        let mask = |view: usize, size: usize| small(masks.clone().narrow(1, view, 1), size);
-        let colors = [0, 1].map(|view| small(images.clone().narrow(1, view, 1).squeeze_dim(1), fine));
-        let larger = |view: usize| enlarged(maps[view].1.clone(), fine / coarse, Some(mask(view, coarse)));
-        SecondLook::new([larger(0), larger(1)], colors, [mask(0, fine), mask(1, fine)], &window.shrunk(canvas / fine), fine)
-    }
-
-    /// Movements along the rays `[N, 1, h, w]`, in network units, for images of a [`SecondLook`] or for parts of them.
-    /// A movement of 1 changes the depth by one unit.
-    ///
-    /// # Panics
-    /// Without a network of details.
-    pub fn relief(&self, images: Tensor<4>) -> Tensor<4> {
-        self.details.as_ref().expect("a network of details").relief(images)
     }
 
     /// The encoder: a transformer reads each photograph alone, a convolution both together.

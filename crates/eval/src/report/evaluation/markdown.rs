@@ -2,10 +2,13 @@
 
 use std::fmt::Write;
 
-use super::{Cost, Evaluation, FIGURES, alignment_means, point_means, seconds, surface_intervals};
+use super::{
+    Cost, Evaluation, FIGURES, alignment_means, part_means, point_means, seconds, surface_intervals,
+};
 use crate::evaluate::config::Protocol;
 use crate::evaluate::{Judged, Kind, Surface, by_person};
 use crate::geometry::Align;
+use crate::parts::PARTS;
 use crate::points::VIEWS;
 use crate::report::{cell, escaped, left_out_markdown, table_markdown};
 use crate::statistics::Interval;
@@ -137,6 +140,26 @@ impl Evaluation<'_> {
                 "## Points\n\nMean distance from the ground-truth points, mm; in brackets after the mean shift of each person's front and \
                  back is removed; then the share of ground-truth points without a prediction.\n\n{}",
                 table_markdown(&[&[""][..], &VIEWS].concat(), with_points.into_iter().map(row))
+            );
+        }
+        let with_parts = made.iter().filter(|judged| !judged.parts.is_empty());
+        let rows: Vec<Vec<String>> = with_parts
+            .map(|judged| {
+                let parts = (0..PARTS.len()).map(|part| match part_means(judged, part) {
+                    Some([relief, far, normals]) => {
+                        format!("{relief:.1}, {normals:.1}°, {:.1} %", 100.0 * far)
+                    }
+                    None => "n/a".into(),
+                });
+                [judged.name.clone()].into_iter().chain(parts).collect()
+            })
+            .collect();
+        if !rows.is_empty() {
+            let _ = writeln!(
+                text,
+                "## Parts of the body\n\nIn the photographs: mean distance in mm from the ground-truth points after the part's median shift \
+                 is removed; mean angle between the normals; share of points that are 4 cm or more away, which the mean leaves out.\n\n{}",
+                table_markdown(&[&[""][..], &PARTS].concat(), rows.into_iter())
             );
         }
         let centres = made.iter().map(|judged| (judged.name.clone(), &judged.surface));

@@ -13,6 +13,7 @@ use super::{Header, number, table};
 use crate::evaluate::config::{EvalConfig, Group, Protocol};
 use crate::evaluate::{Judged, Kind, Outcome, Row, Surface, by_person, is_named};
 use crate::foreign::Traces;
+use crate::parts::{PARTS, PartError};
 use crate::points::{PointError, VIEWS};
 use crate::score::Score;
 use crate::statistics::{Interval, difference, interval, mean, quantile_of_times};
@@ -135,6 +136,7 @@ impl Evaluation<'_> {
                 "difference": self.by_protocol(difference),
                 "photographs": photographs_json(judged),
                 "points_mm": points_json(judged),
+                "parts": parts_json(judged),
                 "geometry_cm": geometry_json(&judged.surface),
                 "mesh_cm": geometry_json(&judged.mesh),
                 "seconds": seconds_json(judged),
@@ -143,6 +145,7 @@ impl Evaluation<'_> {
         });
         report["photographs"] = self.model().map_or(Value::Null, photographs_json);
         report["points_mm"] = self.model().map_or(json!({}), points_json);
+        report["parts"] = self.model().map_or(json!({}), parts_json);
         report["alignment"] = json!({
             "method": self.config.metrics.align,
             "mean_degrees_cm_scale": self.model().and_then(alignment_means),
@@ -280,6 +283,22 @@ fn point_means(judged: &Judged, view: usize) -> Option<[f64; 3]> {
     let errors = || judged.points.iter().filter(|error| error.view == view);
     let over = |of: fn(&PointError) -> f64| mean(&errors().map(of).collect::<Vec<_>>());
     Some([over(|e| 1e3 * e.mean)?, over(|e| 1e3 * e.centred)?, over(|e| e.missed)?])
+}
+
+/// Means over people, turns and photographs: distance in mm, share of far points, degrees between normals.
+fn part_means(judged: &Judged, part: usize) -> Option<[f64; 3]> {
+    let errors = || judged.parts.iter().filter(|error| error.part == part);
+    let over = |of: fn(&PartError) -> Option<f64>| mean(&errors().filter_map(of).collect::<Vec<_>>());
+    Some([over(|e| Some(1e3 * e.relief))?, over(|e| Some(e.far))?, over(|e| e.normals)?])
+}
+
+fn parts_json(judged: &Judged) -> Value {
+    let part = |(i, name): (usize, &&'static str)| {
+        let value = part_means(judged, i)
+            .map(|[relief, far, normals]| json!({ "relief_mm": relief, "far_share": far, "normals_degrees": normals }));
+        (*name, json!(value))
+    };
+    PARTS.iter().enumerate().map(part).collect()
 }
 
 /// Means over people and turns: degrees, centimetres, scale.
