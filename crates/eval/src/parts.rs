@@ -1,9 +1,11 @@
 //! Errors of a photograph's points on head, hands and feet, where depths of a few millimetres are seen. The place of the
 //! whole part does not count.
 
+use glam::{Vec2, Vec3};
 use snapsnap_photo::Joint;
 
 use crate::points::{Pair, is_predicted, normal_error};
+use crate::statistics::mean;
 
 /// Names of the parts in reports.
 pub const PARTS: [&str; 3] = ["head", "hands", "feet"];
@@ -17,7 +19,7 @@ const SEEN: f32 = 0.5;
 /// Least number of pixels that tell an error.
 const LEAST: usize = 64;
 /// Largest error in metres after the part's own shift; the point belongs to another surface.
-const FAR: f32 = 0.04;
+const FAR: f64 = 0.04;
 
 /// Errors of one photograph on one part.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,8 +27,8 @@ pub struct PartError {
     /// Index in [`PARTS`].
     pub part: usize,
     /// Mean distance from the truth in metres after the median shift is removed, where it is below [`FAR`].
-    pub relief: f64,
-    /// Share of the pixels at [`FAR`] or more.
+    pub relief: Option<f64>,
+    /// Share of the pixels at [`FAR`] or more, or without a prediction.
     pub far: f64,
     /// Mean angle between the normals in degrees.
     pub normals: Option<f64>,
@@ -34,18 +36,18 @@ pub struct PartError {
 
 /// Errors on the parts that the joints of a photograph find. `joints` are in pixels of a canvas of `side`² pixels.
 pub fn part_errors(pair: &Pair, joints: &[Joint], side: usize) -> Vec<PartError> {
-    let middle =
-        |rows: &[usize]| rows.iter().map(|row| joints[*row].at).sum::<glam::Vec2>() / rows.len() as f32;
+    let middle = |rows: &[usize]| rows.iter().map(|row| joints[*row].at).sum::<Vec2>() / rows.len() as f32;
     let torso = middle(&[11, 12]).distance(middle(&[23, 24]));
     let mut found = Vec::new();
     for (part, middles) in MIDDLES.iter().enumerate() {
         for rows in *middles {
-            if rows.iter().any(|row| joints[*row].seen < SEEN) && part > 0 {
+            // A back shows the head, but the network sees no ears.
+            if part > 0 && rows.iter().any(|row| joints[*row].seen < SEEN) {
                 continue;
             }
             let (middle, radius) = (middle(rows), RADII[part] * torso);
             let is_inside = |i: usize| {
-                let at = glam::Vec2::new((i % side) as f32 + 0.5, (i / side) as f32 + 0.5);
+                let at = Vec2::new((i % side) as f32 + 0.5, (i / side) as f32 + 0.5);
                 pair.valid[i] > 0.5 && at.distance(middle) < radius
             };
             let valid: Vec<f32> = (0..pair.valid.len()).map(|i| f32::from(u8::from(is_inside(i)))).collect();
@@ -57,20 +59,24 @@ pub fn part_errors(pair: &Pair, joints: &[Joint], side: usize) -> Vec<PartError>
 
 fn error(pair: &Pair, part: usize, side: usize) -> Option<PartError> {
     let points = pair.points.as_chunks::<3>().0.iter().zip(pair.truth.as_chunks::<3>().0).zip(pair.valid);
-    let there = points.filter(|((point, _), valid)| **valid > 0.5 && is_predicted(point));
-    let off: Vec<[f32; 3]> = there.map(|((p, t), _)| [0, 1, 2].map(|axis| p[axis] - t[axis])).collect();
+    let there = points.filter(|(_, valid)| **valid > 0.5);
+    let off = |point: &[f32; 3], truth: &[f32; 3]| {
+        is_predicted(point).then(|| Vec3::from_array(*point) - Vec3::from_array(*truth))
+    };
+    let off: Vec<Option<Vec3>> = there.map(|((point, truth), _)| off(point, truth)).collect();
     if off.len() < LEAST {
         return None;
     }
-    let shift = [0, 1, 2].map(|axis| {
-        let mut values: Vec<f32> = off.iter().map(|off| off[axis]).collect();
-        *values.select_nth_unstable_by(off.len() / 2, f32::total_cmp).1
-    });
-    let length = |off: &[f32; 3]| glam::Vec3::from_array(*off).distance(glam::Vec3::from_array(shift));
-    let near: Vec<f64> = off.iter().map(length).filter(|length| *length < FAR).map(f64::from).collect();
+    let shift = Vec3::from_array([0, 1, 2].map(|axis| {
+        let mut values: Vec<f32> = off.iter().flatten().map(|off| off[axis]).collect();
+        let middle = values.len() / 2;
+        if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
+    }));
+    let lengths = off.iter().flatten().map(|off| f64::from(off.distance(shift)));
+    let near: Vec<f64> = lengths.filter(|length| *length < FAR).collect();
     Some(PartError {
         part,
-        relief: near.iter().sum::<f64>() / near.len().max(1) as f64,
+        relief: mean(&near),
         far: 1.0 - near.len() as f64 / off.len() as f64,
         normals: normal_error(pair, side),
     })
@@ -78,7 +84,6 @@ fn error(pair: &Pair, part: usize, side: usize) -> Option<PartError> {
 
 #[cfg(test)]
 mod tests {
-    use glam::Vec2;
 
     use super::*;
 
@@ -113,10 +118,16 @@ mod tests {
         let found = part_errors(&pair, &joints, side);
         let [head, hand] = found[..] else { panic!("{found:?}") };
         assert_eq!((head.part, hand.part), (0, 1));
-        assert!((head.relief - 0.004).abs() < 2e-4 && head.far == 0.0, "{head:?}");
+        assert!(
+            head.relief.is_some_and(|relief| (relief - 0.004).abs() < 2e-4) && head.far == 0.0,
+            "{head:?}"
+        );
         // Slopes of 8 mm over 2 mm.
         let slope = 4.0_f64.atan().to_degrees();
         assert!(head.normals.is_some_and(|degrees| (degrees - slope).abs() < 0.5), "{head:?}");
-        assert!(hand.relief < 1e-6 && (hand.far - 0.25).abs() < 0.03, "{hand:?}");
+        assert!(
+            hand.relief.is_some_and(|relief| relief < 1e-6) && (hand.far - 0.25).abs() < 0.03,
+            "{hand:?}"
+        );
     }
 }

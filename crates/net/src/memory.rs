@@ -1,12 +1,15 @@
 //! Estimate of a reconstruction's memory on a CPU, from its config.
 
-use crate::config::Config;
+use crate::config::{Config, DetailsConfig};
 
 /// Bytes of an f32.
 const F32: u64 = 4;
 /// Bytes per canvas pixel, measured for a person of the training subjects' height with sides (docs/inference.md): all
 /// images and maps on device and host. A Gaussian in every pixel of every view needs twice as much.
 const PER_PIXEL: u64 = 500;
+/// Images of the finest size that the network of details has at once, for each channel and photograph, as measured
+/// (docs/inference.md).
+const DETAIL_IMAGES: u64 = 6;
 /// Memory that depends neither on size nor on weights: code, buffers of the threads.
 const BASE: u64 = 200 << 20;
 
@@ -20,6 +23,13 @@ impl Config {
         // Second surfaces are two more views.
         let per_pixel = if n.second_layer { PER_PIXEL * 3 / 2 } else { PER_PIXEL };
         let canvas = area(n.resolution).saturating_mul(per_pixel);
-        BASE.saturating_add(parameters.saturating_mul(F32)).saturating_add(head).saturating_add(canvas)
+        let image =
+            |details: &DetailsConfig| area(details.resolution).saturating_mul(F32 * details.dims[0] as u64);
+        let details =
+            n.details.as_ref().map_or(0, |details| image(details).saturating_mul(2 * DETAIL_IMAGES));
+        BASE.saturating_add(parameters.saturating_mul(F32))
+            .saturating_add(head)
+            .saturating_add(canvas)
+            .saturating_add(details)
     }
 }

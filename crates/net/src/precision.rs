@@ -26,16 +26,12 @@ impl Precision {
         if self == Self::F32 {
             return predictor;
         }
-        let is_last = predictor.is_last_layer();
-        map_named(predictor, "", &mut Lower { dtype: self.dtype(), is_last })
+        map_named(predictor, "", &mut Lower(self.dtype()))
     }
 }
 
-struct Lower {
-    dtype: FloatDType,
-    /// Whether the named layer outputs raw points. It stays in f32: bf16 rounds points at 2 m by a centimetre.
-    is_last: fn(&str) -> bool,
-}
+/// Layers that output raw points stay in f32: bf16 rounds points at 2 m by a centimetre.
+struct Lower(FloatDType);
 
 impl NamedMapper for Lower {
     fn map<const D: usize>(&mut self, path: &ParameterPath, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
@@ -43,11 +39,11 @@ impl NamedMapper for Lower {
         let layer = name.rsplit_once('.').map_or("", |(layer, _)| layer);
         let is_layer =
             ["Struct:Linear", "Struct:Conv2d", "Struct:ConvTranspose2d"].contains(&path.container());
-        if !is_layer || (self.is_last)(layer) {
+        if !is_layer || PointPredictor::is_last_layer(layer) {
             return param;
         }
         let (id, values, mapper) = param.consume();
-        Param::from_mapped_value(id, values.cast(self.dtype), mapper)
+        Param::from_mapped_value(id, values.cast(self.0), mapper)
     }
 }
 
@@ -56,7 +52,7 @@ mod tests {
     use burn::tensor::{DType, Device};
 
     use super::*;
-    use crate::config::{Body, Config, HeadKind};
+    use crate::config::{Body, Config, DetailsConfig, HeadKind};
     use crate::weights::{NamedVisitor, random_predictor, visit_named};
 
     /// Names of the weights of layers that stay in f32.
@@ -87,9 +83,11 @@ mod tests {
         };
         assert_eq!(in_f32(&config), of_heads("dpt.head.4"));
         config.network.head = HeadKind::Linear;
-        assert_eq!(in_f32(&config), of_heads("proj"));
+        config.network.details = Some(DetailsConfig::default());
+        let details = ["details.decoder.conv_out.weight".to_owned()];
+        assert_eq!(in_f32(&config), [of_heads("proj"), details.to_vec()].concat());
         (config.network.body, config.network.patch) = (Body::Convolution, 8);
-        let last = ["unet.decoder.conv_out", "unet.side_decoder.conv_out"];
+        let last = ["unet.decoder.conv_out", "unet.side_decoder.conv_out", "details.decoder.conv_out"];
         assert_eq!(in_f32(&config), last.map(|name| format!("{name}.weight")));
     }
 }

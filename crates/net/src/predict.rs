@@ -71,8 +71,15 @@ impl Prediction {
         let heads = if predictor.has_side_heads() { "heads (4)" } else { "heads (2)" };
         let mut maps = record.timed(heads, |_| predictor.heads(&decoded));
         let mut fine = Vec::new();
-        if predictor.has_details() {
-            fine = record.timed("details", |_| predictor.detailed(&mut maps, &images, masks, &window));
+        match predictor.details_resolution() {
+            Some(size) if size <= side => {
+                fine = record.timed("details", |_| predictor.detailed(&mut maps, &images, masks, &window));
+                let [_, height, width, _] = fine[0].1.points.dims();
+                record.steps.push(Step::Details { size: [width, height] });
+            }
+            // The predictor sees as much.
+            Some(_) => record.steps.push(Step::NoDetails { canvas: side }),
+            None => {}
         }
         if maps.len() < predictor.views().len() {
             maps = record

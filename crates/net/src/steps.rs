@@ -28,6 +28,16 @@ pub enum Step {
         /// Channels of each photograph.
         channels: usize,
     },
+    /// The network of details received both photographs in this size (width, height).
+    Details {
+        /// Width and height in pixels.
+        size: [usize; 2],
+    },
+    /// The network of details did not run: the canvas has fewer pixels than the network's image of it.
+    NoDetails {
+        /// Side of the canvas in pixels.
+        canvas: usize,
+    },
     /// Pixels of the sides moved into the silhouettes.
     MovedIntoSilhouettes {
         /// Their number.
@@ -119,6 +129,15 @@ impl fmt::Display for Step {
                     f,
                     "point predictor: 2 photographs of {width}×{height} ({reduced} of {window}{part}), {tokens} tokens each, {channels} \
                      channels"
+                )
+            }
+            Self::Details { size: [width, height] } => {
+                write!(f, "details: 2 photographs of {width}×{height}, the person's window")
+            }
+            Self::NoDetails { canvas } => {
+                write!(
+                    f,
+                    "details were left out: a canvas of {canvas}² has fewer pixels than their network's image of it"
                 )
             }
             Self::MovedIntoSilhouettes { pixels } => {

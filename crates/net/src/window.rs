@@ -54,7 +54,11 @@ impl Window {
         let person = person.filter(|_| config.network.window);
         let cell = config.network.patch * config.upsample_factor();
         let window = person.map_or_else(|| Self::whole(side), |person| person.in_cells(cell, side));
-        if config.network.mirror || config.network.both_ways { window.symmetric(side) } else { window }
+        if config.network.mirror || config.network.both_ways || config.network.details.is_some() {
+            window.symmetric(side)
+        } else {
+            window
+        }
     }
 
     /// Grown until a horizontal flip of the canvas leaves it in place.

@@ -298,6 +298,7 @@ mod tests {
             assert_eq!(again, two);
         }
         assert_eq!(read("default/regressor").regressor, read("default/stage2").regressor);
+        assert!(read("default/details").stage1.only_details);
     }
 
     /// Keys that the files leave out have the published values.

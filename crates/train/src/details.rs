@@ -12,6 +12,7 @@ use snapsnap_net::network::{Input, PointPredictor};
 use snapsnap_net::resample::shrink;
 use snapsnap_ops::{host, mean_lengths};
 
+use crate::config::Stage1Config;
 use crate::points::offsets;
 use crate::task::{Moment, Part};
 
@@ -21,8 +22,6 @@ const WINDOWS: usize = 5;
 const SIDE: usize = 96;
 /// Side of the cells whose relief is measured.
 const CELL: usize = 8;
-/// Distances in pixels between which the relief is compared.
-const SPACINGS: [usize; 4] = [1, 2, 4, 8];
 /// Standard deviation in pixels of the smoothing whose result is no detail: 7 cm at 512 pixels. Whether a whole limb is
 /// too near can hardly be seen, and errors of this kind hide the smaller ones.
 const SMOOTH: f32 = 15.0;
@@ -34,12 +33,14 @@ const MOST: f32 = 0.01;
 const LEAST: f32 = 0.001;
 
 /// The losses of a batch: the mean error of depths in metres, and the mean error of their differences between pixels.
+/// None if no sample shows a person.
 pub fn losses(
     predictor: &PointPredictor,
     config: &Config,
+    weights: &Stage1Config,
     batch: &Stage1Batch,
+    seed: u64,
     at: &Moment,
-    (seed, relief_weight): (u64, f64),
 ) -> Vec<Part> {
     let Some(extent) = at.extent.clone() else { return Vec::new() };
     let window = Window::of_predictor(config, Some(extent));
@@ -50,6 +51,7 @@ pub fn losses(
     let look = predictor.second_look(&predictor.heads(&decoded), &batch.images, &batch.masks, &window);
     let [_, _, h, w] = look.images.dims();
 
+    // True points of the network's pixels, and their depths behind the coarse points.
     let small = |x: Tensor<4>| shrink(window.cut(x), window.rows.len() / h, Downsample::Area);
     let shares = [0, 1].map(|view| small(batch.valid.clone().narrow(1, view, 1)));
     let points = [0, 1].map(|view| {
@@ -59,58 +61,65 @@ pub fn losses(
     });
     let delta = host(predictor.delta())[0];
     let inside = Tensor::cat(shares.to_vec(), 0).greater_equal_elem(0.5).float();
-    let (behind, there) = (host(look.depths_behind(points, delta)), host(inside.clone()));
-    let images = behind.par_chunks_exact(h * w).zip(there.par_chunks_exact(h * w));
-    let on_host = images.map(|(behind, there)| details(behind, there, w)).collect::<Vec<_>>().concat();
-    let behind = Tensor::from_data(TensorData::new(on_host.clone(), [2 * b, 1, h, w]), &inside.device());
+    let (depths, is_inside) = (host(look.depths_behind(points, delta)), host(inside.clone()));
 
-    let mut random = stream(&format!("details/{seed}/{}/{}", at.step, at.first));
-    let mut places = Vec::new();
-    for (image, (behind, there)) in on_host.chunks_exact(h * w).zip(there.chunks_exact(h * w)).enumerate() {
-        let cells = cells(behind, there, w);
-        let all: f32 = cells.iter().map(|(_, relief)| relief).sum();
-        for _ in 0..WINDOWS {
-            let mut left = all * random.random::<f32>();
-            let is_drawn = |(_, relief): &&([usize; 2], f32)| {
-                left -= relief;
-                left <= 0.0
-            };
-            let Some((place, _)) = cells.iter().find(is_drawn).or(cells.last()) else { break };
-            let start = |middle: usize, length: usize, random: &mut dyn rand::RngCore| {
-                let shift = random.random_range(0..SIDE / 2);
-                (middle + shift).saturating_sub(3 * SIDE / 4).min(length.saturating_sub(SIDE))
-            };
-            places.push((image, start(place[0], h, &mut random), start(place[1], w, &mut random)));
-        }
-    }
-    if places.is_empty() {
-        return Vec::new();
-    }
+    // The draws of a photograph do not depend on the others: ranks share a batch.
+    let images = depths.par_chunks_exact(h * w).zip(is_inside.par_chunks_exact(h * w)).enumerate();
+    let drawn = images.map(|(image, (depths, inside))| {
+        let depths = without_mean(depths, inside, w);
+        let (sample, view) = (at.first + image % b, image / b);
+        let mut random = stream(&format!("details/{seed}/{}/{sample}/{view}", at.step));
+        (draw(&cells(&depths, inside, w), [h, w], &mut random), depths)
+    });
+    let (places, depths): (Vec<_>, Vec<_>) = drawn.unzip();
+    let depths = Tensor::from_data(TensorData::new(depths.concat(), [2 * b, 1, h, w]), &inside.device());
     let (rows, columns) = (SIDE.min(h), SIDE.min(w));
     let windows = |x: &Tensor<4>| {
-        let one = |&(image, row, column): &(usize, usize, usize)| {
-            x.clone().narrow(0, image, 1).narrow(2, row, rows).narrow(3, column, columns)
+        let of_image = |(image, places): (usize, &Vec<[usize; 2]>)| -> Vec<Tensor<4>> {
+            let x = x.clone().narrow(0, image, 1);
+            let window =
+                |[row, column]: &[usize; 2]| x.clone().narrow(2, *row, rows).narrow(3, *column, columns);
+            places.iter().map(window).collect()
         };
-        Tensor::cat(places.iter().map(one).collect(), 0)
+        Tensor::cat(places.iter().enumerate().flat_map(of_image).collect(), 0)
     };
-    let (images, behind, inside) = (windows(&look.images), windows(&behind), windows(&inside));
-    let off = (predictor.relief(images) * delta - behind).permute([0, 2, 3, 1]);
+    let off = (predictor.relief(windows(&look.images)) * delta - windows(&depths)).permute([0, 2, 3, 1]);
     let zeros = off.zeros_like();
-    let lengths = mean_lengths(
-        Tensor::cat(vec![off, zeros.clone(), zeros], 3),
-        inside.squeeze_dim(1),
-        &offsets(rows, columns, &SPACINGS),
-    );
+    let off = Tensor::cat(vec![off, zeros.clone(), zeros], 3);
+    let lengths = mean_lengths(off, windows(&inside).squeeze_dim(1), &offsets(rows, columns));
     let differences = lengths.dims()[1] - 1;
     vec![
         Part { name: "points", weight: 1.0, value: lengths.clone().narrow(1, 0, 1).mean() },
-        Part { name: "relief", weight: relief_weight, value: lengths.narrow(1, 1, differences).mean() },
+        Part {
+            name: "relief",
+            weight: weights.relief_weight,
+            value: lengths.narrow(1, 1, differences).mean(),
+        },
     ]
+}
+
+/// Upper left corners of a photograph's windows around random cells, each with the probability of its weight. Without a
+/// cell, the windows are the first one, which shows nobody and has no error.
+fn draw(cells: &[([usize; 2], f32)], size: [usize; 2], random: &mut impl Rng) -> Vec<[usize; 2]> {
+    let all: f32 = cells.iter().map(|(_, weight)| weight).sum();
+    let mut one = || {
+        let mut left = all * random.random::<f32>();
+        let is_drawn = |(_, weight): &&([usize; 2], f32)| {
+            left -= weight;
+            left <= 0.0
+        };
+        let cell = cells.iter().find(is_drawn).or(cells.last());
+        let shifts = [(); 2].map(|()| random.random_range(SIDE / 4..3 * SIDE / 4));
+        cell.map_or([0; 2], |(middle, _)| {
+            [0, 1].map(|axis| middle[axis].saturating_sub(shifts[axis]).min(size[axis].saturating_sub(SIDE)))
+        })
+    };
+    (0..WINDOWS).map(|_| one()).collect()
 }
 
 /// Depths minus their mean over the person's pixels nearby, with the weights of a Gaussian of [`SMOOTH`] pixels; 0 outside
 /// of the person.
-fn details(depths: &[f32], there: &[f32], w: usize) -> Vec<f32> {
+fn without_mean(depths: &[f32], there: &[f32], w: usize) -> Vec<f32> {
     let reach = (3.0 * SMOOTH) as isize;
     let weights: Vec<f32> = (-reach..=reach).map(|i| (-0.5 * (i as f32 / SMOOTH).powi(2)).exp()).collect();
     // Along rows and then, since rows become columns, along columns.
@@ -162,4 +171,45 @@ fn cells(behind: &[f32], there: &[f32], w: usize) -> Vec<([usize; 2], f32)> {
         }
     }
     found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A plane, a bump of 3 pixels and a step to another limb.
+    #[test]
+    fn details_are_small_and_windows_show_them() {
+        let (h, w) = (160, 130);
+        let is_inside = |i: usize| (20..120).contains(&(i % w)) && (10..150).contains(&(i / w));
+        let inside: Vec<f32> = (0..h * w).map(|i| f32::from(u8::from(is_inside(i)))).collect();
+        let bump = |i: usize| {
+            let (x, y) = ((i % w) as f32 - 60.0, (i / w) as f32 - 100.0);
+            0.01 * (-(x * x + y * y) / 18.0).exp()
+        };
+        let depths: Vec<f32> =
+            (0..h * w).map(|i| if is_inside(i) { 0.3 + bump(i) } else { f32::NAN }).collect();
+        let found = without_mean(&depths, &inside, w);
+        let at = |x: usize, y: usize| found[y * w + x];
+        // The bump's mean over 15 pixels is 9 / (9 + 225) of its height.
+        assert!((at(60, 100) - 0.01 * (1.0 - 9.0 / 234.0)).abs() < 1e-4, "{}", at(60, 100));
+        assert!(at(25, 20).abs() < 1e-6 && at(0, 0) == 0.0 && at(60, 5) == 0.0);
+        let cells = cells(&found, &inside, w);
+        let weight = |x: usize, y: usize| {
+            let middle = [y / CELL * CELL + CELL / 2, x / CELL * CELL + CELL / 2];
+            cells.iter().find(|(place, _)| *place == middle).map(|(_, weight)| *weight)
+        };
+        assert_eq!(weight(0, 0), None);
+        // The head counts more often, then the bump.
+        assert!(weight(60, 20).is_some_and(|head| (head - HEAD.1 * LEAST).abs() < 1e-5));
+        assert!(weight(60, 100) > weight(30, 140).map(|plain| 2.0 * plain));
+        let mut random = stream("a test of windows");
+        let places: Vec<_> = (0..200).flat_map(|_| draw(&cells, [h, w], &mut random)).collect();
+        assert!(places.iter().all(|[row, column]| row + SIDE <= h && column + SIDE <= w));
+        let of_head = places.iter().filter(|[row, _]| *row < 10).count() as f64 / places.len() as f64;
+        assert!((0.4..0.9).contains(&of_head), "{of_head}");
+        // Smaller pictures, and pictures of nobody.
+        assert_eq!(draw(&cells, [64, 64], &mut random), [[0; 2]; WINDOWS]);
+        assert_eq!(draw(&[], [h, w], &mut random), [[0; 2]; WINDOWS]);
+    }
 }

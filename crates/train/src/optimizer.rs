@@ -110,7 +110,8 @@ impl Optimizer {
         let Some(device) = parameters.first().map(|first| self.device(first.values.device())) else {
             return Rows::new();
         };
-        let values = parameters.iter().map(|parameter| (parameter.name.clone(), parameter.values.clone()));
+        let trained = parameters.iter().filter(|parameter| gradients.contains_key(&parameter.name));
+        let values = trained.map(|parameter| (parameter.name.clone(), parameter.values.clone()));
         let mut rows = moved(values.collect(), &device);
         let mut gradients = moved(gradients, &device);
         let work = parameters.into_iter().filter_map(|Parameter { name, shape, .. }| {

@@ -57,7 +57,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
         let truth = truth.narrow(3, window.columns.start, w).reshape([b, h, w, 3]);
         // Invalid points may be 10⁸ metres or NaN. They do not reach the gradient, since they are not inside.
         let off = map.points.clone() - truth;
-        let offsets = if relief { offsets(h, w, &SPACINGS) } else { vec![[0, 0]] };
+        let offsets = if relief { offsets(h, w) } else { vec![[0, 0]] };
         let lengths = mean_lengths(off, inside.clone(), &offsets);
         if offsets.len() > 1 {
             reliefs.push(lengths.clone().narrow(1, 1, offsets.len() - 1).mean());
@@ -74,9 +74,9 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
     Losses { regression: sum(regression), confidence: sum(confidence), relief: relief.then(|| sum(reliefs)) }
 }
 
-/// Pixel offsets: `0, 0` for the errors themselves, `spacings` down and across for their differences.
-pub(crate) fn offsets(h: usize, w: usize, spacings: &[usize]) -> Vec<[usize; 2]> {
-    let apart = spacings.iter().flat_map(|&spacing| [[spacing, 0], [0, spacing]]);
+/// Pixel offsets: `0, 0` for the errors themselves, [`SPACINGS`] down and across for their differences.
+pub(crate) fn offsets(h: usize, w: usize) -> Vec<[usize; 2]> {
+    let apart = SPACINGS.into_iter().flat_map(|spacing| [[spacing, 0], [0, spacing]]);
     [[0, 0]].into_iter().chain(apart.filter(|[down, across]| *down < h && *across < w)).collect()
 }
 
@@ -96,7 +96,7 @@ mod tests {
                 places().map(|(row, column)| f32::from(u8::from(is_inside(row, column)))).collect();
             let off = Tensor::<4>::from_data(TensorData::new(off, [1, h, w, 3]), &Device::flex());
             let inside = Tensor::<3>::from_data(TensorData::new(inside, [1, h, w]), &Device::flex());
-            let offsets = offsets(h, w, &SPACINGS);
+            let offsets = offsets(h, w);
             assert_eq!(offsets.len(), 9);
             let lengths = mean_lengths(off, inside, &offsets);
             f64::from(lengths.narrow(1, 1, 8).mean().into_scalar::<f32>())

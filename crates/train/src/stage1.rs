@@ -103,13 +103,7 @@ impl Task for PointTask {
         let batch = Stage1Batch::new(items, &self.device);
         if self.losses.only_details {
             let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
-            return Ok(details::losses(
-                predictor,
-                &self.networks,
-                &batch,
-                &at,
-                (self.seed, self.losses.relief_weight),
-            ));
+            return Ok(details::losses(predictor, &self.networks, &self.losses, &batch, self.seed, &at));
         }
         let prediction = self.predict(networks, &batch, at.extent);
         let relief = self.losses.relief_weight > 0.0;

@@ -100,6 +100,8 @@ fn details_are_trained_alone() {
         }
     }
     assert!(moved > 40 && kept > 40, "{moved} {kept}");
+    let said = refused(train(1, &config, &temporary.path().join("random")).args(set()).args(only));
+    assert!(said.contains("--weights"), "{said}");
     let without = ["--set=stage1.only_details=true"];
     let said = refused(train(1, &config, &temporary.path().join("without")).args(without));
     assert!(said.contains("`stage1.only_details`") && said.contains("`network.details`"), "{said}");

@@ -117,6 +117,7 @@ impl Contestant {
                 let is_changed = model.photographs != PhotographChanges::default();
                 let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
                 let true_masks = &item.photographs;
+                let unchanged = item;
                 let item = own.as_ref().unwrap_or(item);
                 let mut made = model.reconstruct(item, inputs)?;
                 let aligned = match metrics.align {
@@ -127,7 +128,7 @@ impl Contestant {
                     }
                 };
                 // Pictures can be compared without errors of points.
-                let points = errors(people, row, item, inputs, &made.maps, model.side());
+                let points = errors(people, row, unchanged, inputs, &made.maps, model.side());
                 let points = points.map_err(|e| e.to_string());
                 let has_background = model.photographs.has_background();
                 Ok(Shown {

@@ -104,11 +104,15 @@ impl Config {
         let is_enlarged = n.resolution.is_multiple_of(n.net_resolution) && n.resolution.is_multiple_of(4);
         // Both halves of an image have a whole number of pixels at every level.
         let is_halved = n.net_resolution.is_multiple_of(2 * n.patch);
-        let details = n.details.as_ref().map_or(n.net_resolution, |details| details.resolution);
+        // Details are left out of smaller canvases.
+        let details =
+            n.details.as_ref().map(|details| details.resolution).filter(|size| *size <= n.resolution);
         // Windows are whole patches of the predictor's input.
-        let is_detailed = details.is_multiple_of(n.net_resolution)
-            && n.resolution.is_multiple_of(details)
-            && (n.patch * details / n.net_resolution).is_multiple_of(CELL);
+        let is_detailed = details.is_none_or(|size| {
+            size.is_multiple_of(n.net_resolution)
+                && n.resolution.is_multiple_of(size)
+                && (n.patch * size / n.net_resolution).is_multiple_of(CELL)
+        });
         let problems = [
             (
                 "network.feature_dim",
@@ -153,9 +157,10 @@ impl Config {
             ),
             (
                 "network.details.resolution",
-                n.details.is_some() && !is_detailed,
+                !is_detailed,
                 format!(
-                    "is {details}, must be a multiple of `network.net_resolution` ({}) and divide `network.resolution` ({})",
+                    "must be a multiple of `network.net_resolution` ({}) and divide `network.resolution` ({}); a patch \
+                     must have a multiple of {CELL} of its pixels",
                     n.net_resolution, n.resolution
                 ),
             ),

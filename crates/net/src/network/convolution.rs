@@ -6,7 +6,6 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
 use super::completion::Completion;
-use super::rope;
 use super::unet::{Attention, Decoder, LEVELS, Levels, UNet, UNetSizes};
 use crate::config::{NetworkConfig, Sides};
 use snapsnap_ops::bilinear;
@@ -52,11 +51,6 @@ impl PointUNet {
         Self { side_attention: None, side_decoder: None, completion: None, ..self }
     }
 
-    /// Whether the layer of this name gives the raw points.
-    pub(super) fn is_last_layer(name: &str) -> bool {
-        name.ends_with("decoder.conv_out")
-    }
-
     /// Whether the network has layers of the unseen sides.
     pub fn has_sides(&self) -> bool {
         self.side_decoder.is_some() || self.completion.is_some()
@@ -81,9 +75,7 @@ impl PointUNet {
     pub fn sides(&self, Levels { images, tokens }: &Levels) -> Option<[Tensor<4>; 2]> {
         let (attention, decoder) = (self.side_attention.as_ref()?, self.side_decoder.as_ref()?);
         let [_, _, rows, columns] = images[LEVELS - 1].dims();
-        let c = &self.config;
-        let rope = rope([rows, columns], c.dec_dim / c.dec_heads, &tokens.device());
-        let coarsest = attention.image(attention.forward(tokens.clone(), &rope), [rows, columns]);
+        let coarsest = attention.image(attention.forward(tokens.clone(), [rows, columns]), [rows, columns]);
         let rows: Vec<Tensor<4>> = images.iter().map(|image| image.clone().mean_dim(3)).collect();
         Some(self.pair(decoder.out(decoder.features(coarsest, &rows))))
     }

@@ -59,17 +59,19 @@ pub struct SecondLook {
     /// `[2·B, INPUTS, h, w]`, all fronts, then all backs.
     pub images: Tensor<4>,
     /// Enlarged maps of front and back, in network units and without anchors.
-    pub maps: [PointMap; 2],
+    maps: [PointMap; 2],
     /// Each photograph's share of the person `[B, 1, h, w]`.
-    pub masks: [Tensor<4>; 2],
+    masks: [Tensor<4>; 2],
     rays: [Rays; 2],
 }
 
 impl PointPredictor {
     /// Refines the maps of front and back, in network units and without anchors (docs/method.md, "Details"). Returns
     /// maps of `network.details.resolution`, and moves the given maps by the mean movement of the person in each pixel.
-    /// `images` `[B, 2, 3, S, S]` and `masks` `[B, 2, S, S]` are the photographs. Without a network of details there are
-    /// no maps.
+    /// `images` `[B, 2, 3, S, S]` and `masks` `[B, 2, S, S]` are the photographs.
+    ///
+    /// # Panics
+    /// Without a network of details.
     pub fn detailed(
         &self,
         maps: &mut [(View, PointMap)],
@@ -77,17 +79,15 @@ impl PointPredictor {
         masks: &Tensor<4>,
         window: &Window,
     ) -> Vec<(View, PointMap)> {
-        let Some(details) = &self.details else { return Vec::new() };
         let [canvas, coarse] = [self.config.resolution, self.config.net_resolution];
-        let fine = details.resolution;
+        let fine = self.details.as_ref().expect("a network of details").resolution;
         let look = self.second_look(maps, images, masks, window);
         let relief = self.relief(look.images);
         let b = relief.dims()[0] / 2;
         let reliefs = [0, b].map(|from| relief.clone().narrow(0, from, b));
-        let moved = |view: View, map: PointMap, relief: Tensor<4>, side: usize| {
-            let place = window.shrunk(canvas / side);
-            let directions = Rays::new(view, OPPOSITE, side, &place, &relief.device()).directions;
-            PointMap { points: map.points + directions * relief.permute([0, 2, 3, 1]), ..map }
+        let moved = |map: PointMap, relief: Tensor<4>, rays: &Rays| PointMap {
+            points: map.points + rays.directions.clone() * relief.permute([0, 2, 3, 1]),
+            ..map
         };
         for (i, (view, map)) in maps.iter_mut().take(2).enumerate() {
             /// Least share of the person in a pixel that is moved.
@@ -95,10 +95,12 @@ impl PointPredictor {
             let small = |x: Tensor<4>| shrink(x, fine / coarse, Downsample::Area);
             let mask = look.masks[i].clone();
             let mean = small(reliefs[i].clone() * mask.clone()) / small(mask).clamp_min(MIN_SHARE);
-            *map = moved(*view, map.clone(), mean, coarse);
+            let rays = Rays::new(*view, OPPOSITE, coarse, &window.shrunk(canvas / coarse), &mean.device());
+            *map = moved(map.clone(), mean, &rays);
         }
-        let views = [View::Front, View::Back].into_iter().zip(look.maps).zip(reliefs);
-        views.map(|((view, map), relief)| (view, moved(view, map, relief, fine))).collect()
+        let fine = look.maps.into_iter().zip(reliefs).zip(&look.rays);
+        let fine = fine.map(|((map, relief), rays)| moved(map, relief, rays));
+        [View::Front, View::Back].into_iter().zip(fine).collect()
     }
 
     /// Input of the network of details for maps of front and back, as in [`Self::detailed`].
@@ -167,7 +169,8 @@ impl SecondLook {
         let distances = [&maps, &smooth].map(|maps| {
             [0, 1].map(|i| {
                 let distance = (maps[i].points.clone() * rays[i].forward.clone()).sum_dim(3);
-                distance.permute([0, 3, 1, 2]) * masks[i].clone()
+                let outside = masks[i].clone().lower_equal_elem(0.0);
+                (distance.permute([0, 3, 1, 2]) * masks[i].clone()).mask_fill(outside, 0.0)
             })
         });
         let [distances, smooth] = distances;
@@ -248,7 +251,9 @@ mod tests {
             ) -> Param<Tensor<D>> {
                 match path.name().as_str() {
                     "details.decoder.conv_out.weight" => param.map(|values| values.zeros_like()),
-                    "details.decoder.conv_out.bias" => param.map(|values| values.zeros_like() + self.0),
+                    "details.decoder.conv_out.bias" => {
+                        param.map(|values| values.zeros_like() + f64::from(self.0) / UNIT)
+                    }
                     _ => param,
                 }
             }

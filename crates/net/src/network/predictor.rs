@@ -210,17 +210,14 @@ impl PointPredictor {
         self.views().len() > 2 && self.config.sides == Sides::Predicted
     }
 
-    /// Whether a second network refines the photographs' points.
-    pub fn has_details(&self) -> bool {
-        self.details.is_some()
+    /// Side of the canvas in the image that a second network receives to refine the photographs' points.
+    pub fn details_resolution(&self) -> Option<usize> {
+        self.details.as_ref().map(|details| details.resolution)
     }
 
-    /// Whether the layer of this name in a checkpoint outputs the raw points.
-    pub(crate) fn is_last_layer(&self) -> fn(&str) -> bool {
-        match &self.body {
-            Body::Transformer(_) => Dust3r::is_last_layer,
-            Body::Convolution(_) => PointUNet::is_last_layer,
-        }
+    /// Whether the layer of this name in a checkpoint outputs raw points.
+    pub(crate) fn is_last_layer(name: &str) -> bool {
+        Dust3r::is_last_layer(name) || name.ends_with("decoder.conv_out")
     }
 
     /// δ `[1]`.

@@ -10,7 +10,7 @@ use super::block::{EncoderBlock, layer_norm, normalise};
 use super::dpt::{ResidualConvUnit, conv1x1, conv3x3};
 use super::rope;
 use snapsnap_ops::layers::{conv2d, linear};
-use snapsnap_ops::{Rope, as_weight, bilinear};
+use snapsnap_ops::{as_weight, bilinear};
 
 /// Number of image sizes, each half of the one before.
 pub(super) const LEVELS: usize = 4;
@@ -23,6 +23,8 @@ pub(super) struct Attention {
     norm: LayerNorm,
     /// Projection to the channels of the image.
     proj: Linear,
+    #[module(skip)]
+    head_dim: usize,
 }
 
 impl Attention {
@@ -33,13 +35,18 @@ impl Attention {
             blocks: (0..depth).map(|_| EncoderBlock::new(dim, heads, device)).collect(),
             norm: layer_norm(dim, device),
             proj: LinearConfig::new(dim, to).init(device),
+            head_dim: dim / heads,
         }
     }
 
-    /// Tokens `[B, N, from]` → normalised tokens `[B, N, dim]`.
-    pub(super) fn forward(&self, tokens: Tensor<3>, rope: &Rope) -> Tensor<3> {
+    /// Tokens `[B, N, from]` of a grid of rows and columns → normalised tokens `[B, N, dim]`.
+    pub(super) fn forward(&self, tokens: Tensor<3>, grid: [usize; 2]) -> Tensor<3> {
         let tokens = linear(&self.embed, tokens);
-        normalise(&self.norm, self.blocks.iter().fold(tokens, |x, block| block.forward(x, rope)))
+        if self.blocks.is_empty() {
+            return normalise(&self.norm, tokens);
+        }
+        let rope = rope(grid, self.head_dim, &tokens.device());
+        normalise(&self.norm, self.blocks.iter().fold(tokens, |x, block| block.forward(x, &rope)))
     }
 
     /// Normalised tokens as an image.
@@ -111,8 +118,6 @@ pub(super) struct UNet {
     down: Vec<Conv2d>,
     attention: Attention,
     pub(super) decoder: Decoder,
-    #[module(skip)]
-    head_dim: usize,
 }
 
 /// Sizes of a [`UNet`].
@@ -139,7 +144,6 @@ impl UNet {
             down: widths.windows(2).map(|pair| conv3x3(pair[0], pair[1], 2, true, device)).collect(),
             attention: Attention::new([coarsest, dim, coarsest], [depth, heads], device),
             decoder: Decoder::new(widths, last_dim, outputs, device),
-            head_dim: dim / heads,
         }
     }
 
@@ -158,8 +162,7 @@ impl UNet {
             images.push(x.clone());
         }
         let [b, c, h, w] = x.dims();
-        let rope = rope([h, w], self.head_dim, &x.device());
-        let tokens = self.attention.forward(x.reshape([b, c, h * w]).swap_dims(1, 2), &rope);
+        let tokens = self.attention.forward(x.reshape([b, c, h * w]).swap_dims(1, 2), [h, w]);
         Levels { images, tokens }
     }
 

@@ -1,7 +1,7 @@
 //! Checkpoints: reading the authors' files, our own file format, and filling the networks from it.
 //!
 //! Our file is one `.safetensors` with the authors' keys (`scale`, `dust3r.*`, `pred_unet.*`, `gs_conv.*`) and this
-//! project's keys (`unet.*`, `side.*`), in one [`Precision`](crate::config::Precision), and the config as TOML in its
+//! project's keys (`unet.*`, `details.*`, `side.*`), in one [`Precision`](crate::config::Precision), and the config as TOML in its
 //! metadata.
 
 mod file;

@@ -14,7 +14,7 @@ use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_data::dataset::{Folder, Layout};
-use snapsnap_net::weights::schema::{self, Part};
+use snapsnap_net::weights::schema::{self, DETAILS, Part};
 use snapsnap_net::weights::{WeightFile, random_predictor, random_regressors};
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::networks::Networks;
@@ -124,6 +124,9 @@ fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result
 fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     let mut plan = Plan::new(arguments, ranks)?;
     plan.keep_start();
+    if plan.config.stage1.only_details && plan.begun.is_none() && plan.config.training.weights.is_none() {
+        bail!("`stage1.only_details` needs a trained point predictor: give --weights FILE");
+    }
     let task = PointTask::new(&plan.folders, &plan.config, &plan.device)?;
     plan.check_validation(task.data().count);
     plan.run(&task, |tracked| {
@@ -375,11 +378,16 @@ fn example(folder: &Folder) -> Option<[PathBuf; 2]> {
 /// averages, samples, and the last layers of the heads. --dry-run measures the actual memory.
 fn least_memory(config: &TrainConfig, ranks: usize) -> u64 {
     let (n, batch) = (&config.network, config.training.batch.div_ceil(ranks) as u64);
-    let parameters = schema::parameters(&config.networks(), Part::PointPredictor) as u64;
+    let parameters =
+        schema::tensors(&config.networks()).into_iter().filter(|tensor| tensor.part == Part::PointPredictor);
+    // Frozen layers have no gradients and moments.
+    let is_trained = |name: &str| !config.stage1.only_details || name.starts_with(DETAILS);
+    let parameters: usize =
+        parameters.map(|tensor| tensor.elements() * if is_trained(&tensor.name) { 5 } else { 2 }).sum();
     // Two photographs with masks and four point maps with masks, each as loaded and as used.
     let sample = 2 * (2 * 4 + 4 * 4) * n.resolution.pow(2) as u64;
     // A window may be as small as a tenth of the canvas.
     let share = if n.window { 10 } else { 1 };
     let heads = 4 * (2 * n.last_dim + n.feature_dim) as u64 * n.net_resolution.pow(2) as u64 / share;
-    4 * (5 * parameters + batch * (sample + heads))
+    4 * (parameters as u64 + batch * (sample + heads))
 }

@@ -145,11 +145,11 @@ impl Evaluation<'_> {
         let with_parts = made.iter().filter(|judged| !judged.parts.is_empty());
         let rows: Vec<Vec<String>> = with_parts
             .map(|judged| {
-                let parts = (0..PARTS.len()).map(|part| match part_means(judged, part) {
-                    Some([relief, far, normals]) => {
-                        format!("{relief:.1}, {normals:.1}°, {:.1} %", 100.0 * far)
-                    }
-                    None => "n/a".into(),
+                let shown =
+                    |figure: Option<f64>| figure.map_or("n/a".into(), |figure| format!("{figure:.1}"));
+                let parts = (0..PARTS.len()).map(|part| {
+                    let [relief, normals, far] = part_means(judged, part).map(shown);
+                    format!("{relief}, {normals}°, {far} %")
                 });
                 [judged.name.clone()].into_iter().chain(parts).collect()
             })

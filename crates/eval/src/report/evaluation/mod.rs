@@ -285,18 +285,17 @@ fn point_means(judged: &Judged, view: usize) -> Option<[f64; 3]> {
     Some([over(|e| 1e3 * e.mean)?, over(|e| 1e3 * e.centred)?, over(|e| e.missed)?])
 }
 
-/// Means over people, turns and photographs: distance in mm, share of far points, degrees between normals.
-fn part_means(judged: &Judged, part: usize) -> Option<[f64; 3]> {
+/// Means over people, turns and photographs: distance in mm, degrees between normals, share of far points in per cent.
+fn part_means(judged: &Judged, part: usize) -> [Option<f64>; 3] {
     let errors = || judged.parts.iter().filter(|error| error.part == part);
     let over = |of: fn(&PartError) -> Option<f64>| mean(&errors().filter_map(of).collect::<Vec<_>>());
-    Some([over(|e| Some(1e3 * e.relief))?, over(|e| Some(e.far))?, over(|e| e.normals)?])
+    [over(|e| e.relief.map(|relief| 1e3 * relief)), over(|e| e.normals), over(|e| Some(100.0 * e.far))]
 }
 
 fn parts_json(judged: &Judged) -> Value {
     let part = |(i, name): (usize, &&'static str)| {
-        let value = part_means(judged, i)
-            .map(|[relief, far, normals]| json!({ "relief_mm": relief, "far_share": far, "normals_degrees": normals }));
-        (*name, json!(value))
+        let [relief, normals, far] = part_means(judged, i);
+        (*name, json!({ "relief_mm": relief, "normals_degrees": normals, "far_percent": far }))
     };
     PARTS.iter().enumerate().map(part).collect()
 }
