@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use snapsnap_tests::{Numbers, refused, snapsnap, succeed};
+use snapsnap_tests::{Numbers, TRAINING, refused, snapsnap, succeed};
 
 use super::{logged, people, place, train};
 
@@ -85,7 +85,10 @@ fn details_are_trained_alone() {
     let [start, run] = ["start.safetensors", "run"].map(|name| temporary.path().join(name));
     let details = ["network.anchor=ray", "network.details.resolution=64", "network.details.dims=[4,4,8,8]"];
     let set = || details.iter().flat_map(|key| ["--set", key]);
-    succeed(snapsnap().arg("init-weights").arg("--config").arg(&config).args(set()).arg("-o").arg(&start));
+    let networks = temporary.path().join("networks.toml");
+    fs::write(&networks, TRAINING.split("[samples]").next().expect("sections of networks")).expect("writes");
+    let mut init = snapsnap();
+    succeed(init.arg("init-weights").arg("--config").arg(networks).args(set()).arg("-o").arg(&start));
     let only = ["--set=stage1.only_details=true", "--set=training.steps=3", "--set=schedule.warm_up=0"];
     succeed(train(1, &config, &run).args(set()).args(only).arg("--weights").arg(&start));
     let [start, end] = [start, run.join("last.safetensors")].map(|path| Numbers::read(&path));
