@@ -26,9 +26,9 @@ const FAR: f64 = 0.04;
 pub struct PartError {
     /// Index in [`PARTS`].
     pub part: usize,
-    /// Mean distance from the truth in metres after the median shift is removed, where it is below [`FAR`].
+    /// Mean distance from the truth in metres after the median shift is removed, where it is below 4 cm.
     pub relief: Option<f64>,
-    /// Share of the pixels at [`FAR`] or more, or without a prediction.
+    /// Share of the pixels at 4 cm or more, or without a prediction.
     pub far: f64,
     /// Mean angle between the normals in degrees.
     pub normals: Option<f64>,

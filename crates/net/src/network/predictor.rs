@@ -231,7 +231,8 @@ impl PointPredictor {
     }
 
     /// Enlarges a map from network pixels to canvas pixels, and multiplies its points by δ (docs/method.md,
-    /// "Enlargement and delta"). `weights` are as for [`enlarged`].
+    /// "Enlargement and delta"). `weights` `[B, 1, H, W]` ≥ 0 are the person's share of each
+    /// pixel, for `mask-aware` interpolation.
     pub fn enlarged(&self, map: PointMap, factor: usize, weights: Option<Tensor<4>>) -> PointMap {
         let PointMap { points, conf } = enlarged(map, factor, weights);
         PointMap { points: self.times_delta(points), conf }
