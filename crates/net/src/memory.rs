@@ -7,8 +7,9 @@ const F32: u64 = 4;
 /// Bytes per canvas pixel, measured for a person of the training subjects' height with sides (docs/inference.md): all
 /// images and maps on device and host. A Gaussian in every pixel of every view needs twice as much.
 const PER_PIXEL: u64 = 500;
-/// Images of the finest size that the network of details has at once, for each channel and photograph, as measured
-/// (docs/inference.md).
+/// Images of the finest size that the network of details has at once, for each channel and photograph: its input, the skip
+/// image, and the images of a residual unit. Counted in the code and not measured: of the default sizes, the regressor
+/// needs more.
 const DETAIL_IMAGES: u64 = 6;
 /// Memory that depends neither on size nor on weights: code, buffers of the threads.
 const BASE: u64 = 200 << 20;

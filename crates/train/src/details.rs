@@ -177,7 +177,7 @@ fn cells(behind: &[f32], there: &[f32], w: usize) -> Vec<([usize; 2], f32)> {
 mod tests {
     use super::*;
 
-    /// A plane, a bump of 3 pixels and a step to another limb.
+    /// A plane with a bump of 3 pixels.
     #[test]
     fn details_are_small_and_windows_show_them() {
         let (h, w) = (160, 130);
