@@ -173,7 +173,7 @@ impl SideInput {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use burn::module::Param;
     use burn::tensor::TensorData;
     use glam::Vec3;
@@ -186,10 +186,11 @@ mod tests {
     use crate::parameters::{NamedMapper, ParameterPath, map_named};
     use crate::weights::random_predictor;
 
-    const SIDE: usize = 64;
+    pub const SIDE: usize = 64;
     const WIDTHS: [usize; 4] = [4, 4, 8, 8];
 
-    fn config() -> NetworkConfig {
+    /// A predictor of a few thousand parameters with completed sides.
+    pub fn config() -> NetworkConfig {
         NetworkConfig {
             body: Body::Convolution,
             patch: 8,

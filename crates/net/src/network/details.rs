@@ -206,36 +206,20 @@ mod tests {
 
     use super::*;
     use crate::Prediction;
-    use crate::config::{Anchor, Body, Config, NetworkConfig};
+    use crate::config::{Config, NetworkConfig};
+    use crate::network::completion::tests::{SIDE, config as small};
     use crate::parameters::{NamedMapper, ParameterPath, map_named};
     use crate::steps::Record;
     use crate::weights::random_predictor;
 
-    const SIDE: usize = 64;
-
     fn config(details: Option<usize>) -> Config {
         let network = NetworkConfig {
-            body: Body::Convolution,
-            patch: 8,
-            enc_dim: 16,
-            enc_heads: 2,
-            enc_depth: 1,
-            dec_dim: 16,
-            dec_heads: 2,
-            dec_depth: 1,
-            layer_dims: [4, 4, 8, 8],
-            side_dims: [4, 4, 8, 8],
-            last_dim: 8,
-            resolution: SIDE,
             net_resolution: SIDE / 2,
             delta: 0.2,
-            anchor: Anchor::Ray,
-            mask_channel: true,
-            mirror: true,
             both_ways: true,
-            sides: crate::config::Sides::Completed,
+            second_layer: false,
             details: details.map(|resolution| DetailsConfig { resolution, dims: [4, 4, 8, 8] }),
-            ..NetworkConfig::default()
+            ..small()
         };
         Config { network, ..Config::default() }
     }
