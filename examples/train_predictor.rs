@@ -79,8 +79,8 @@ fn compare(networks: &Networks, config: &Config, items: Vec<Stage1Item>, device:
     let batch = Stage1Batch::new(items, device);
     let mut record = Record::default();
     let masks = batch.masks.to_data().try_to_vec::<f32>().expect("numbers");
-    let window = Window::of_predictor(config, Window::around_person(&masks, config.network.resolution));
-    let prediction = Prediction::new(predictor, config, batch.images, &batch.masks, window, &mut record);
+    let person = Window::around_person(&masks, config.network.resolution);
+    let prediction = Prediction::new(predictor, config, batch.images, &batch.masks, person, &mut record);
     losses(&prediction, &batch.points, &batch.valid, false)
 }
 
@@ -99,13 +99,13 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     let temporary = tempfile::tempdir()?;
     let folder = data_set(&temporary.path().join("people"), config.network.resolution)?;
-    let samples = |split, flip| {
-        let augment = Augment { flip, ..Augment::none() };
+    let samples = |split| {
+        let augment = Augment::none();
         let samples = SampleConfig { front_within_degrees: 30.0, augment, ..SampleConfig::default() };
         Stage1::new(folder.clone(), Some(split), samples)
     };
-    let train = samples(Split::Train, true)?;
-    let held_out = samples(Split::Val, false)?;
+    let train = samples(Split::Train)?;
+    let held_out = samples(Split::Val)?;
     let held_out: Vec<_> = (0..BATCH).map(|index| held_out.sample(index)).collect::<Result<_, _>>()?;
     let error =
         |networks: &Networks| millimetres(&compare(&networks.valid(), &config, held_out.clone(), &device));

@@ -20,6 +20,8 @@ done
 # A few people in views of the size of photographs.
 people large train 903 30 --config configs/data/default.toml --set views.resolution=1024
 people large val 903 4 --config configs/data/default.toml --set views.resolution=1024
+people close train 904 900 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
+people close val 904 16 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
 data="people/default/synth people/default/makehuman people/default/avatars people/phone/synth people/phone/makehuman people/phone/avatars"
 cargo xtask train-stage1 --config configs/default/photographs.toml --data $data --resume -o runs/default-photographs
 # The network of the sides begins with random weights.
@@ -33,6 +35,18 @@ cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --wei
   -o runs/default-points
 cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors --resume \
   -o runs/default-both
+# Details have random weights at first. The other layers stay as they are.
+details="--set network.details.resolution=1024"
+if [ ! -e runs/default-details ]; then
+  photographs="--set network.side_heads=false --set network.second_layer=false $details"
+  cargo xtask init-weights --config configs/studies/network.toml $photographs -o runs/details-random.safetensors
+  cargo xtask import-weights runs/default-both/best.safetensors --fill runs/details-random.safetensors $photographs \
+    -o runs/details-start.safetensors
+fi
+cargo xtask train-stage1 --config configs/default/details.toml --data people/close/makehuman people/close/avatars \
+  --weights runs/details-start.safetensors --resume -o runs/default-details
+[ -e runs/detailed.safetensors ] || cargo xtask import-weights runs/default-both/best.safetensors --fill runs/default-details/best.safetensors \
+  $details -o runs/detailed.safetensors
 cargo xtask train-stage2 --config configs/default/regressor.toml --data people/large/synth people/large/makehuman people/large/avatars \
-  --weights runs/default-both/best.safetensors --resume -o runs/default
+  --weights runs/detailed.safetensors --resume -o runs/default
 cargo xtask import-weights runs/default/best.safetensors --half -o default.safetensors

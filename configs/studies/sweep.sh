@@ -33,10 +33,8 @@ row no-mask groups --set network.mask_channel=false
 row no-rays groups --set network.ray_channels=false
 row no-mirror groups --set network.mirror=false
 row no-anchor groups --set 'network.anchor="none"'
-row no-flip groups --set samples.augment.flip=false
 row no-place groups --set samples.placed_share=0.0
-row plain groups --set network.mask_channel=false --set network.ray_channels=false --set network.mirror=false --set 'network.anchor="none"' \
-  --set samples.augment.flip=false
+row plain groups --set network.mask_channel=false --set network.ray_channels=false --set network.mirror=false --set 'network.anchor="none"'
 transformer="--set network.body=\"transformer\" --set network.enc_depth=4 --set network.dec_dim=128 --set network.dec_depth=3 \
   --set network.layer_dims=[16,32,48,64] --set network.feature_dim=32 --set network.last_dim=16 --set network.hooks=[0,1,2,3] --set network.patch=16"
 row transformer groups $transformer

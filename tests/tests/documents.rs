@@ -165,12 +165,16 @@ fn less(words: &[String]) -> Words {
                 more.extend(["--set", key]);
             }
             // Their schedules end with a fall.
-            let fall = ["configs/default/photographs.toml", "configs/default/stage1.toml"];
-            if words.iter().any(|word| fall.contains(&word.as_str())) {
+            let of_default =
+                |name: &str| words.iter().any(|word| *word == format!("configs/default/{name}.toml"));
+            if ["photographs", "stage1", "details"].iter().any(|name| of_default(name)) {
                 more.extend(["--set", "schedule.fall=0"]);
             }
-            if words.iter().any(|word| word == "configs/default/regressor.toml") {
+            if of_default("regressor") || of_default("details") {
                 more.extend(["--set", "network.resolution=256"]);
+            }
+            if of_default("details") {
+                more.extend(["--set", "network.details.resolution=256"]);
             }
         }
         "evaluate" => {

@@ -262,13 +262,12 @@ fn wrong_arguments_are_refused_before_any_work() {
         assert!(!out.exists(), "{arguments:?} wrote something");
         message
     };
-    let table: [(&[&str], &str); 9] = [
+    let table: [(&[&str], &str); 8] = [
         (&["--subjects", "0"], "--subjects is 0, must be 1 to"),
         (&["--shard", "2/2"], "`2/2` is no shard"),
         (&["--set", "views.count=0"], "`views.count`: is 0, must be 1 to 4096"),
         (&["--set", "views.resolution=9000"], "`views.resolution`"),
         (&["--set", "jitter.view.pitch=-1"], "`jitter.view.pitch`: is -1"),
-        (&["--set", "views.samples=2"], "`views.samples` is now called `views.samples_per_axis`"),
         (&["--set", "views.colour=1"], "unknown field `colour`"),
         (&["--config", "/no/such.toml"], "/no/such.toml: cannot read"),
         (&["--set", "views.layout=authors"], "must end in `_1024_24`"),

@@ -191,21 +191,6 @@ fn another_file_gives_the_tensors_that_are_in_none_of_the_first() {
     assert!(with(Some(&place.path("absent"))).is_err());
 }
 
-/// Keys that are gone are ignored with the value that they always have now, and refused with others.
-#[test]
-fn keys_that_are_gone_are_ignored_or_refused() {
-    let opened = |line: &str| Config::from_toml(&format!("[network]\nenc_depth = 1\n{line}\n"), "x", &[]);
-    let older = opened("drop_empty = false\nsteepest = 4.0\n[regressor]\nstraight_color = true");
-    assert_eq!(older.expect("opens"), opened("").expect("opens"));
-    let refused = opened("drop_empty = true").expect_err("is refused").to_string();
-    assert!(
-        refused.contains("`network.drop_empty` is gone: it is always false, and cannot be true"),
-        "{refused}"
-    );
-    let refused = opened("drop_empty = false\nenc_depths = 1").expect_err("is refused").to_string();
-    assert!(refused.contains("enc_depths"), "{refused}");
-}
-
 #[test]
 fn half_precision_files_load() {
     let place = place();

@@ -44,34 +44,18 @@ pub enum ConfigError {
     },
 }
 
-/// Removed keys, dotted, each with the values (TOML) that are still accepted. An empty list accepts every value.
-pub type Removed = &'static [(&'static str, &'static [&'static str])];
-
 /// The type of a config. Every key has a default, so that a file may hold any part of it.
 pub trait Schema: DeserializeOwned + Serialize {
-    /// Renamed keys, dotted: (former name, present name). A former name is refused; the error has the new name.
-    const RENAMED: &'static [(&'static str, &'static str)] = &[];
-
-    /// Lists of removed keys. A removed key with an accepted value is ignored, so that older files still load; other
-    /// values are refused.
-    const REMOVED: &'static [Removed] = &[];
-
     /// The dotted key of the first refused value, and the reason.
     fn refusal(&self) -> Option<(String, String)>;
-
-    /// Whether a key of [`Self::REMOVED`] says something else than this config does, although the value is listed: a
-    /// key that follows another one.
-    fn contradicts(&self, _key: &str, _value: &str) -> bool {
-        false
-    }
 
     /// Reads and checks a file and the files that it extends; `overrides` are `a.b=c` assignments on top.
     ///
     /// # Errors
     /// [`ConfigError`], naming file, key and allowed values.
     fn from_file(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let (table, gone, origin) = layers::<Self>(path)?;
-        build(table, gone, origin, overrides)
+        let (table, origin) = layers::<Self>(path)?;
+        build(table, origin, overrides)
     }
 
     /// Parses and checks TOML text that extends no file; `origin` names it in errors, `overrides` are `a.b=c`
@@ -80,11 +64,11 @@ pub trait Schema: DeserializeOwned + Serialize {
     /// # Errors
     /// [`ConfigError`], naming origin, key and allowed values.
     fn from_toml(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let (table, gone, extended) = layer::<Self>(text, origin)?;
+        let (table, extended) = layer::<Self>(text, origin)?;
         if extended.is_some() {
             return Err(syntax(origin, format!("`{EXTENDS}`: only a file can extend another")));
         }
-        build(table, gone, origin.to_owned(), overrides)
+        build(table, origin.to_owned(), overrides)
     }
 
     /// The config as TOML, with every key that has a value.
@@ -147,14 +131,10 @@ fn syntax(origin: &str, message: String) -> ConfigError {
     ConfigError::Syntax { origin: origin.to_owned(), message: lines.join("\n") }
 }
 
-/// Removed keys of a config with their values.
-type Gone = BTreeMap<&'static str, String>;
-
-/// The merged keys of a file and of the files that it extends, the removed keys among them, and the names of all these
-/// files for errors.
-fn layers<T: Schema>(path: &Path) -> Result<(Table, Gone, String), ConfigError> {
+/// The merged keys of a file and of the files that it extends, and the names of all these files for errors.
+fn layers<T: Schema>(path: &Path) -> Result<(Table, String), ConfigError> {
     let mut chain: Vec<PathBuf> = Vec::new();
-    let (mut merged, mut gone) = (Table::new(), Gone::new());
+    let mut merged = Table::new();
     let mut next = Some(path.to_owned());
     while let Some(path) = next {
         let origin = path.display().to_string();
@@ -162,22 +142,18 @@ fn layers<T: Schema>(path: &Path) -> Result<(Table, Gone, String), ConfigError> 
             return Err(syntax(&origin, format!("more than {MAX_CHAIN} configs extend one another")));
         }
         let text = file::read_text(&path, MAX_BYTES).map_err(FileError::read(&path))?;
-        let (below, further, extended) = layer::<T>(&text, &origin)?;
-        for (key, value) in further {
-            gone.entry(key).or_insert(value);
-        }
+        let (below, extended) = layer::<T>(&text, &origin)?;
         next = extended.map(|name| path.parent().unwrap_or(Path::new("")).join(name));
         let above = std::mem::replace(&mut merged, below);
         merge(&mut merged, above);
         chain.push(path);
     }
     let names: Vec<String> = chain.iter().map(|path| path.display().to_string()).collect();
-    Ok((merged, gone, names.join(" extending ")))
+    Ok((merged, names.join(" extending ")))
 }
 
-/// The keys of one TOML text, whose names and types are checked, its removed keys, and the name of the file that it
-/// extends.
-fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Gone, Option<String>), ConfigError> {
+/// The keys of one TOML text, whose names and types are checked, and the name of the file that it extends.
+fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Option<String>), ConfigError> {
     let mut table: Table = toml::from_str(text).map_err(|e| syntax(origin, e.to_string()))?;
     let extended = match table.remove(EXTENDS) {
         None => None,
@@ -186,14 +162,9 @@ fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Gone, Option<Str
             return Err(syntax(origin, format!("`{EXTENDS}` is a {}, must be a path", other.type_str())));
         }
     };
-    let gone = check_names::<T>(&mut table, origin)?;
     // serde would accept an array in place of a section.
     if let Some((key, value)) = table.iter().find(|(_, value)| !value.is_table()) {
         return Err(syntax(origin, format!("`{key}` is a {}, must be a section [{key}]", value.type_str())));
-    }
-    if !gone.is_empty() {
-        Value::Table(table.clone()).try_into::<T>().map_err(|e| syntax(origin, e.to_string()))?;
-        return Ok((table, gone, extended));
     }
     // Parsed from the text, so that messages have line numbers. `extends` is blanked out; it precedes all sections.
     let mut own: Vec<&str> = text.lines().collect();
@@ -202,46 +173,7 @@ fn layer<T: Schema>(text: &str, origin: &str) -> Result<(Table, Gone, Option<Str
         *line = "";
     }
     toml::from_str::<T>(&own.join("\n")).map_err(|e| syntax(origin, e.to_string()))?;
-    Ok((table, gone, extended))
-}
-
-/// Refuses renamed keys and takes out removed keys, which it returns.
-fn check_names<T: Schema>(table: &mut Table, origin: &str) -> Result<Gone, ConfigError> {
-    for (old, new) in T::RENAMED {
-        let (section, key) = old.rsplit_once('.').expect("a dotted key");
-        let section = section.split('.').try_fold(&*table, |at, name| at.get(name)?.as_table());
-        if section.is_some_and(|section| section.contains_key(key)) {
-            return Err(syntax(origin, format!("`{old}` is now called `{new}`")));
-        }
-    }
-    let mut found = Gone::new();
-    for (gone, values) in T::REMOVED.iter().copied().flatten() {
-        let (section, key) = gone.rsplit_once('.').expect("a dotted key");
-        let mut at = Some(&mut *table);
-        for name in section.split('.') {
-            at = at.and_then(|at| at.get_mut(name)?.as_table_mut());
-        }
-        match at.and_then(|at| at.remove(key)).map(|there| there.to_string()) {
-            None => {}
-            Some(there) if is_gone::<T>(gone, &there) => drop(found.insert(gone, there)),
-            Some(there) => {
-                let message = format!("`{gone}` is gone: it is always {}, and cannot be {there}", values[0]);
-                return Err(syntax(origin, message));
-            }
-        }
-    }
-    Ok(found)
-}
-
-/// Whether `key` is in [`Schema::REMOVED`] and accepts `value` (TOML).
-pub fn is_gone<T: Schema>(key: &str, value: &str) -> bool {
-    // 4 and 4.0 are the same value.
-    let number = |text: &str| text.parse::<f64>().ok();
-    // A recorded f32 has the digits of an f64.
-    let is_near = |now: f64| number(value).is_some_and(|value| value as f32 == now as f32);
-    let is_same = |now: &&str| *now == value || number(now).is_some_and(is_near);
-    let mut all = T::REMOVED.iter().copied().flatten();
-    all.any(|(gone, values)| *gone == key && (values.is_empty() || values.iter().any(is_same)))
+    Ok((table, extended))
 }
 
 /// Merges `above` into `below`, section by section and key by key; `above` wins.
@@ -256,16 +188,9 @@ fn merge(below: &mut Table, above: Table) {
     }
 }
 
-fn build<T: Schema>(
-    mut table: Table,
-    mut gone: Gone,
-    origin: String,
-    overrides: &[String],
-) -> Result<T, ConfigError> {
+fn build<T: Schema>(mut table: Table, origin: String, overrides: &[String]) -> Result<T, ConfigError> {
     for assignment in overrides {
-        let origin = format!("--set {assignment}");
-        assign(&mut table, assignment).map_err(|message| syntax(&origin, message))?;
-        gone.extend(check_names::<T>(&mut table, &origin)?);
+        assign(&mut table, assignment).map_err(|message| syntax(&format!("--set {assignment}"), message))?;
     }
     let origin = match overrides {
         [] => origin,
@@ -273,10 +198,6 @@ fn build<T: Schema>(
     };
     let config: T =
         Value::Table(table).try_into().map_err(|e: toml::de::Error| syntax(&origin, e.to_string()))?;
-    if let Some((key, value)) = gone.iter().find(|(key, value)| config.contradicts(key, value)) {
-        let message = format!("is gone, and {value} contradicts the key that it follows now (CHANGELOG.md)");
-        return Err(ConfigError::Value { origin, key: (*key).to_owned(), message });
-    }
     match config.refusal() {
         Some((key, message)) => Err(ConfigError::Value { origin, key, message }),
         None => Ok(config),
@@ -334,9 +255,6 @@ mod tests {
     }
 
     impl Schema for Config {
-        const RENAMED: &'static [(&'static str, &'static str)] = &[("network.width", "network.dim")];
-        const REMOVED: &'static [Removed] = &[&[("network.slope", &["4.0"])], &[("network.cache", &[])]];
-
         fn refusal(&self) -> Option<(String, String)> {
             (self.network.dim > 9).then(|| ("network.dim".into(), "must be at most 9".into()))
         }
@@ -390,27 +308,9 @@ mod tests {
     }
 
     #[test]
-    fn keys_that_are_gone_may_have_the_values_that_the_program_has_now() {
-        let read = |text: &str| Config::from_toml(text, "x", &[]).map_err(|e| e.to_string());
-        let text = "[network]\nslope = 4\ncache = \"points\"\ndim = 3\n";
-        assert_eq!(read(text), Ok(Config { network: Network { dim: 3, name: String::new() } }));
-        let message = read("[network]\nslope = 3.0\n").expect_err("another value");
-        assert_eq!(message, "x: `network.slope` is gone: it is always 4.0, and cannot be 3.0");
-        assert!(is_gone::<Config>("network.slope", "4.0") && !is_gone::<Config>("network.dim", "4.0"));
-    }
-
-    #[test]
     fn a_message_quotes_the_beginning_of_a_long_line() {
         let text = format!("[network]\nname = [{}\n", "1, ".repeat(100_000));
         let message = Config::from_toml(&text, "x", &[]).expect_err("a list").to_string();
         assert!(message.contains("name = [1, 1") && message.len() < 2000, "{}", message.len());
-    }
-
-    #[test]
-    fn former_names_are_refused_with_the_present_ones() {
-        let text = Config::from_toml("[network]\nwidth = 3\n", "x", &[]).expect_err("former").to_string();
-        assert_eq!(text, "x: `network.width` is now called `network.dim`");
-        let set = Config::from_toml("", "x", &["network.width=3".into()]).expect_err("former").to_string();
-        assert_eq!(set, "--set network.width=3: `network.width` is now called `network.dim`");
     }
 }

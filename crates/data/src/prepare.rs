@@ -79,8 +79,6 @@ impl Default for ViewsConfig {
 }
 
 impl Schema for DataConfig {
-    const RENAMED: &'static [(&'static str, &'static str)] = &[("views.samples", "views.samples_per_axis")];
-
     fn refusal(&self) -> Option<(String, String)> {
         let ViewsConfig { count, arrangement, layout, .. } = self.views;
         let most = if self.views.high_resolution { MAX_RESOLUTION / 2 } else { MAX_RESOLUTION };

@@ -23,6 +23,8 @@ pub const OPPOSITE: f64 = 180.0;
 
 /// Pixels of the finest level per pixel of the coarsest level of a U-shaped network, along an axis.
 pub(crate) const CELL: usize = 8;
+/// Pixels of the image of [`DetailsConfig`] per pixel of its network's finest level, along an axis.
+pub(crate) const PATCH: usize = 2;
 
 const HULL_REACH: f64 = 0.05;
 /// Half of the range from black to white.
@@ -218,16 +220,16 @@ impl NetworkConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DetailsConfig {
-    /// Side of the square image of the canvas that the network receives, in pixels.
+    /// Side of the square image of the canvas that the network receives, in pixels. Its finest level has half of it.
     pub resolution: usize,
-    /// Channels of its four levels (pixels of 1, 2, 4 and 8 times the finest size).
+    /// Channels of its four levels (2, 4, 8 and 16 pixels of the image).
     #[serde(deserialize_with = "snapsnap_base::config::four")]
     pub dims: [usize; 4],
 }
 
 impl Default for DetailsConfig {
     fn default() -> Self {
-        Self { resolution: 512, dims: [24, 48, 72, 96] }
+        Self { resolution: 1024, dims: [24, 48, 72, 96] }
     }
 }
 

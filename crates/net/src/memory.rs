@@ -1,6 +1,6 @@
 //! Estimate of a reconstruction's memory on a CPU, from its config.
 
-use crate::config::{Config, DetailsConfig};
+use crate::config::{Config, DetailsConfig, PATCH};
 
 /// Bytes of an f32.
 const F32: u64 = 4;
@@ -24,8 +24,9 @@ impl Config {
         // Second surfaces are two more views.
         let per_pixel = if n.second_layer { PER_PIXEL * 3 / 2 } else { PER_PIXEL };
         let canvas = area(n.resolution).saturating_mul(per_pixel);
-        let image =
-            |details: &DetailsConfig| area(details.resolution).saturating_mul(F32 * details.dims[0] as u64);
+        let image = |details: &DetailsConfig| {
+            area(details.resolution / PATCH).saturating_mul(F32 * details.dims[0] as u64)
+        };
         let details =
             n.details.as_ref().map_or(0, |details| image(details).saturating_mul(2 * DETAIL_IMAGES));
         BASE.saturating_add(parameters.saturating_mul(F32))

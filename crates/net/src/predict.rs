@@ -1,10 +1,12 @@
 //! Photographs on their canvases → predicted points on the canvas, for trainings and for the reconstruction.
 
+use std::ops::Range;
+
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use snapsnap_ops::has_kernels;
 
-use crate::config::{Config, NetworkConfig};
+use crate::config::{CELL, Config, NetworkConfig, PATCH};
 use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::photograph::Photograph;
 use crate::steps::{Record, Step};
@@ -33,23 +35,25 @@ impl Prediction {
     ) -> Self {
         let side = config.network.resolution;
         let masks = photographs.map(|photo| &*photo.mask).concat();
-        let window = Window::of_predictor(config, Window::around_person(&masks, side));
+        let person = Window::around_person(&masks, side);
         let images = photographs.map(|photo| &*photo.rgb).concat();
         let images = Tensor::from_data(TensorData::new(images, [1, 2, 3, side, side]), device);
         let masks = Tensor::from_data(TensorData::new(masks, [1, 2, side, side]), device);
-        Self::new(predictor, config, images, &masks, window, record)
+        Self::new(predictor, config, images, &masks, person, record)
     }
 
-    /// Predicted point maps of fronts and backs `[B,2,3,S,S]` in [−1, 1] with masks `[B,2,S,S]`, in a window.
+    /// Predicted point maps of fronts and backs `[B,2,3,S,S]` in [−1, 1] with masks `[B,2,S,S]`. `person` is the box of all
+    /// pixels with a mask above 0.
     pub fn new(
         predictor: &PointPredictor,
         config: &Config,
         images: Tensor<5>,
         masks: &Tensor<4>,
-        window: Window,
+        person: Option<Window>,
         record: &mut Record,
     ) -> Self {
         let [b, _, colors, side, _] = images.dims();
+        let window = Window::of_predictor(config, person.clone());
         let input = record.timed("input", |_| {
             // All fronts, then all backs.
             let photographs = images.clone().swap_dims(0, 1).reshape([2 * b, colors, side, side]);
@@ -73,9 +77,11 @@ impl Prediction {
         let mut fine = Vec::new();
         match predictor.details_resolution() {
             Some(size) if size <= side => {
-                fine = record.timed("details", |_| predictor.detailed(&mut maps, &images, masks, &window));
-                let [_, height, width, _] = fine[0].1.points.dims();
-                record.steps.push(Step::Details { size: [width, height] });
+                let columns = details_columns(person.as_ref(), &window, side, size);
+                let width = columns.len();
+                fine = record
+                    .timed("details", |_| predictor.detailed(&mut maps, &images, masks, &window, columns));
+                record.steps.push(Step::Details { size: [width, window.rows.len() * size / side] });
             }
             // The predictor sees as much.
             Some(_) => record.steps.push(Step::NoDetails { canvas: side }),
@@ -97,6 +103,20 @@ impl Prediction {
     pub fn pasted(self, config: &NetworkConfig) -> Vec<(View, PointMap)> {
         each_view(self.maps, |(view, map)| (view, map.pasted(config, view, &self.window)))
     }
+}
+
+/// Columns of the window that the network of details receives, in pixels of its image of a canvas of `side`² pixels: the
+/// person's, symmetric about the middle, in whole cells.
+fn details_columns(person: Option<&Window>, window: &Window, side: usize, image: usize) -> Range<usize> {
+    /// Pixels beside the person.
+    const MARGIN: usize = 32;
+    let width = window.columns.len() * image / side;
+    let beside = person.map_or(0, |person| {
+        let beside = person.columns.start.min(side - person.columns.end);
+        (beside.saturating_sub(window.columns.start) * image / side).saturating_sub(MARGIN)
+    });
+    let beside = beside / (PATCH * CELL) * (PATCH * CELL);
+    beside..width - beside
 }
 
 /// Applies `change` to the map of each view. On a CPU, the operations of a map run on one thread each.

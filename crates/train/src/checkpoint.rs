@@ -95,5 +95,5 @@ pub(crate) fn load<T: Task>(
     learner.networks = std::mem::take(&mut learner.networks).with_rows(&weights);
     learner.optimizer.restore(&learner.networks, &mut rows, &progress.times, device);
     learner.progress = progress;
-    Ok(run.current(learner.config))
+    Ok(run)
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use snapsnap_base::config::{Removed, outside};
+use snapsnap_base::config::outside;
 use snapsnap_data::sample::{Augment, SampleConfig};
 use snapsnap_net::config::{ConfMode, Config, ModeConfig, NetworkConfig, Precision, RegressorConfig, Schema};
 
@@ -137,63 +137,6 @@ impl Default for Stage2Config {
 }
 
 impl Schema for TrainConfig {
-    const REMOVED: &'static [Removed] = &[
-        Config::GONE,
-        &[
-            // As `mode.compat` says.
-            ("samples.compat", &[]),
-            ("samples.high_resolution", &[]),
-            ("training.shuffle", &[]),
-            // As `network.second_layer` says.
-            ("samples.second_depth", &[]),
-            ("samples.repeat", &["50"]),
-            ("samples.seed", &[]),
-            ("samples.augment.white_balance", &["0.06", "0.0"]),
-            ("samples.augment.jpeg_quality", &["70", "0"]),
-            ("samples.augment.background", &["true", "false"]),
-            ("samples.augment.background_color", &["true", "false"]),
-            ("samples.augment.blur", &["0.0"]),
-            ("samples.augment.noise", &["0.0"]),
-            ("training.accumulate", &["1"]),
-            ("training.clip", &["1.0"]),
-            ("training.prefetch", &[]),
-            ("training.validate_on", &["\"val\""]),
-            ("training.gradient_checkpointing", &["false"]),
-            ("optimizer.decay_all", &[]),
-            ("optimizer.beta1", &["0.9"]),
-            ("optimizer.epsilon", &["1e-8"]),
-            ("optimizer.weight_decay", &["0.05"]),
-            ("optimizer.muon.momentum", &["0.95"]),
-            ("optimizer.muon.weight_decay", &["0.02"]),
-            ("schedule.overhang", &["100"]),
-            ("schedule.rise", &["0.01"]),
-            ("schedule.start_divisor", &["25.0"]),
-            ("schedule.end_divisor", &["10000.0"]),
-            ("schedule.end", &["0.01"]),
-            ("stage1.confidence_weight", &["0.5"]),
-            ("stage1.normals_weight", &["0.05", "0.0"]),
-            ("stage2.l1_share", &["0.8"]),
-            ("stage2.point_noise", &["0.0"]),
-            ("stage2.point_map_cache", &[]),
-        ],
-    ];
-
-    fn contradicts(&self, key: &str, value: &str) -> bool {
-        let compat = self.mode.compat;
-        match key {
-            "samples.compat" | "samples.high_resolution" | "optimizer.decay_all" => {
-                value != compat.to_string()
-            }
-            "training.shuffle" | "samples.augment.background" | "samples.augment.background_color" => {
-                value == compat.to_string()
-            }
-            "samples.augment.white_balance" | "samples.augment.jpeg_quality" => {
-                value.parse().is_ok_and(|value: f64| (value == 0.0) != compat)
-            }
-            _ => self.networks().contradicts(key, value),
-        }
-    }
-
     fn refusal(&self) -> Option<(String, String)> {
         self.networks().refusal().or_else(|| self.problem())
     }
@@ -242,8 +185,13 @@ impl TrainConfig {
             return Some((key.into(), message));
         }
         let refuse = |key: &str, message: &str| Some((key.to_owned(), message.to_owned()));
-        if self.stage1.only_details && self.network.details.is_none() {
-            return refuse("stage1.only_details", "needs `network.details`");
+        let details = self.network.details.as_ref();
+        let is_used = details.is_some_and(|details| details.resolution <= self.network.resolution);
+        if self.stage1.only_details && !is_used {
+            return refuse(
+                "stage1.only_details",
+                "needs `network.details`, whose resolution is at most the canvas'",
+            );
         }
         if t.precision == Precision::F16 {
             return refuse(

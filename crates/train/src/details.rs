@@ -1,14 +1,14 @@
 //! Stage 1 of the network of details alone: it learns from small windows of the photographs, most of them where the
 //! coarse points lack a relief (docs/method.md, "Losses of stage 1").
 
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::Tensor;
 use rand::Rng;
 use rayon::prelude::*;
 use snapsnap_base::random::stream;
 use snapsnap_data::sample::Stage1Batch;
 use snapsnap_net::Window;
 use snapsnap_net::config::{Config, Downsample};
-use snapsnap_net::network::{Input, PointPredictor};
+use snapsnap_net::network::{Input, PointPredictor, without_mean};
 use snapsnap_net::resample::shrink;
 use snapsnap_ops::{host, mean_lengths};
 
@@ -17,14 +17,11 @@ use crate::points::offsets;
 use crate::task::{Moment, Part};
 
 /// Windows of each photograph.
-const WINDOWS: usize = 5;
-/// Side of a window, in pixels of the network of details. At 512 pixels this is 44 cm.
-const SIDE: usize = 96;
+const WINDOWS: usize = 8;
+/// Side of a window, in pixels of the photographs' image. At 1024 pixels this is 44 cm.
+const SIDE: usize = 192;
 /// Side of the cells whose relief is measured.
-const CELL: usize = 8;
-/// Standard deviation in pixels of the smoothing whose result is no detail: 7 cm at 512 pixels. Whether a whole limb is
-/// too near can hardly be seen, and errors of this kind hide the smaller ones.
-const SMOOTH: f32 = 15.0;
+const CELL: usize = 16;
 /// Part of the person's height that counts as the head, and how many times more often its cells are drawn.
 const HEAD: (f32, f32) = (0.125, 8.0);
 /// Relief of a cell in metres above which windows are not drawn more often: a step between two limbs.
@@ -49,7 +46,9 @@ pub fn losses(
     let masks = batch.masks.clone().swap_dims(0, 1).reshape([2 * b, 1, side, side]);
     let decoded = predictor.decode(predictor.encode(Input::new(config, photographs, masks, &window)));
     let look = predictor.second_look(&predictor.heads(&decoded), &batch.images, &batch.masks, &window);
-    let [_, _, h, w] = look.images.dims();
+    // Pixels of the photographs' image, and of its patches.
+    let [h, w] = look.size();
+    let patch = h / look.images.dims()[2];
 
     // True points of the network's pixels, and their depths behind the coarse points.
     let small = |x: Tensor<4>| shrink(window.cut(x), window.rows.len() / h, Downsample::Area);
@@ -61,32 +60,36 @@ pub fn losses(
     });
     let delta = host(predictor.delta())[0];
     let inside = Tensor::cat(shares.to_vec(), 0).greater_equal_elem(0.5).float();
-    let (depths, is_inside) = (host(look.depths_behind(points, delta)), host(inside.clone()));
+    // Whether a whole limb is too near can hardly be seen, and errors of this kind hide the smaller ones.
+    let factor = h * config.network.resolution / (config.network.net_resolution * window.rows.len());
+    let depths = without_mean(look.depths_behind(points, delta), &inside, factor);
+    let (on_host, is_inside) = (host(depths.clone()), host(inside.clone()));
 
     // The draws of a photograph do not depend on the others: ranks share a batch.
-    let images = depths.par_chunks_exact(h * w).zip(is_inside.par_chunks_exact(h * w)).enumerate();
+    let images = on_host.par_chunks_exact(h * w).zip(is_inside.par_chunks_exact(h * w)).enumerate();
     let drawn = images.map(|(image, (depths, inside))| {
-        let depths = without_mean(depths, inside, w);
         let (sample, view) = (at.first + image % b, image / b);
         let mut random = stream(&format!("details/{seed}/{}/{sample}/{view}", at.step));
-        (draw(&cells(&depths, inside, w), [h, w], &mut random), depths)
+        draw(&cells(depths, inside, w), [h, w], patch, &mut random)
     });
-    let (places, depths): (Vec<_>, Vec<_>) = drawn.unzip();
-    let depths = Tensor::from_data(TensorData::new(depths.concat(), [2 * b, 1, h, w]), &inside.device());
+    let places: Vec<_> = drawn.collect();
     let (rows, columns) = (SIDE.min(h), SIDE.min(w));
-    let windows = |x: &Tensor<4>| {
+    let windows = |x: &Tensor<4>, scale: usize| {
         let of_image = |(image, places): (usize, &Vec<[usize; 2]>)| -> Vec<Tensor<4>> {
             let x = x.clone().narrow(0, image, 1);
-            let window =
-                |[row, column]: &[usize; 2]| x.clone().narrow(2, *row, rows).narrow(3, *column, columns);
+            let window = |[row, column]: &[usize; 2]| {
+                let x = x.clone().narrow(2, *row / scale, rows / scale);
+                x.narrow(3, *column / scale, columns / scale)
+            };
             places.iter().map(window).collect()
         };
         Tensor::cat(places.iter().enumerate().flat_map(of_image).collect(), 0)
     };
-    let off = (predictor.relief(windows(&look.images)) * delta - windows(&depths)).permute([0, 2, 3, 1]);
+    let off =
+        (predictor.relief(windows(&look.images, patch)) * delta - windows(&depths, 1)).permute([0, 2, 3, 1]);
     let zeros = off.zeros_like();
     let off = Tensor::cat(vec![off, zeros.clone(), zeros], 3);
-    let lengths = mean_lengths(off, windows(&inside).squeeze_dim(1), &offsets(rows, columns));
+    let lengths = mean_lengths(off, windows(&inside, 1).squeeze_dim(1), &offsets(rows, columns));
     let differences = lengths.dims()[1] - 1;
     vec![
         Part { name: "points", weight: 1.0, value: lengths.clone().narrow(1, 0, 1).mean() },
@@ -98,9 +101,14 @@ pub fn losses(
     ]
 }
 
-/// Upper left corners of a photograph's windows around random cells, each with the probability of its weight. Without a
+/// Upper left corners of a photograph's windows, at multiples of `patch`, around random cells, each with the probability of its weight. Without a
 /// cell, the windows are the first one, which shows nobody and has no error.
-fn draw(cells: &[([usize; 2], f32)], size: [usize; 2], random: &mut impl Rng) -> Vec<[usize; 2]> {
+fn draw(
+    cells: &[([usize; 2], f32)],
+    size: [usize; 2],
+    patch: usize,
+    random: &mut impl Rng,
+) -> Vec<[usize; 2]> {
     let all: f32 = cells.iter().map(|(_, weight)| weight).sum();
     let mut one = || {
         let mut left = all * random.random::<f32>();
@@ -111,39 +119,12 @@ fn draw(cells: &[([usize; 2], f32)], size: [usize; 2], random: &mut impl Rng) ->
         let cell = cells.iter().find(is_drawn).or(cells.last());
         let shifts = [(); 2].map(|()| random.random_range(SIDE / 4..3 * SIDE / 4));
         cell.map_or([0; 2], |(middle, _)| {
-            [0, 1].map(|axis| middle[axis].saturating_sub(shifts[axis]).min(size[axis].saturating_sub(SIDE)))
+            let first =
+                |axis: usize| middle[axis].saturating_sub(shifts[axis]).min(size[axis].saturating_sub(SIDE));
+            [0, 1].map(|axis| first(axis) / patch * patch)
         })
     };
     (0..WINDOWS).map(|_| one()).collect()
-}
-
-/// Depths minus their mean over the person's pixels nearby, with the weights of a Gaussian of [`SMOOTH`] pixels; 0 outside
-/// of the person.
-fn without_mean(depths: &[f32], there: &[f32], w: usize) -> Vec<f32> {
-    let reach = (3.0 * SMOOTH) as isize;
-    let weights: Vec<f32> = (-reach..=reach).map(|i| (-0.5 * (i as f32 / SMOOTH).powi(2)).exp()).collect();
-    // Along rows and then, since rows become columns, along columns.
-    let smooth = |image: &[[f32; 2]], w: usize| {
-        let h = image.len() / w;
-        let mut turned = vec![[0.0; 2]; image.len()];
-        for (row, line) in image.chunks_exact(w).enumerate() {
-            for column in 0..w {
-                let mut sum = [0.0; 2];
-                for (offset, weight) in (-reach..=reach).zip(&weights) {
-                    if let Some(value) = column.checked_add_signed(offset).and_then(|at| line.get(at)) {
-                        sum = [sum[0] + weight * value[0], sum[1] + weight * value[1]];
-                    }
-                }
-                turned[column * h + row] = sum;
-            }
-        }
-        turned
-    };
-    let inside = |(depth, share): (&f32, &f32)| if *share > 0.5 { [*depth, 1.0] } else { [0.0; 2] };
-    let image: Vec<[f32; 2]> = depths.iter().zip(there).map(inside).collect();
-    let smoothed = smooth(&smooth(&image, w), image.len() / w);
-    let off = image.iter().zip(smoothed).map(|(own, mean)| own[1] * (own[0] - mean[0] / mean[1].max(1e-6)));
-    off.collect()
 }
 
 /// The middle of each cell of [`CELL`]² pixels that shows the person, and the mean deviation of its depths from their
@@ -177,23 +158,17 @@ fn cells(behind: &[f32], there: &[f32], w: usize) -> Vec<([usize; 2], f32)> {
 mod tests {
     use super::*;
 
-    /// A plane with a bump of 3 pixels.
+    /// A plane with a bump.
     #[test]
-    fn details_are_small_and_windows_show_them() {
-        let (h, w) = (160, 130);
-        let is_inside = |i: usize| (20..120).contains(&(i % w)) && (10..150).contains(&(i / w));
+    fn windows_show_details() {
+        let (h, w) = (320, 260);
+        let is_inside = |i: usize| (40..240).contains(&(i % w)) && (20..300).contains(&(i / w));
         let inside: Vec<f32> = (0..h * w).map(|i| f32::from(u8::from(is_inside(i)))).collect();
         let bump = |i: usize| {
-            let (x, y) = ((i % w) as f32 - 60.0, (i / w) as f32 - 100.0);
-            0.01 * (-(x * x + y * y) / 18.0).exp()
+            let (x, y) = ((i % w) as f32 - 120.0, (i / w) as f32 - 200.0);
+            0.01 * (-(x * x + y * y) / 72.0).exp()
         };
-        let depths: Vec<f32> =
-            (0..h * w).map(|i| if is_inside(i) { 0.3 + bump(i) } else { f32::NAN }).collect();
-        let found = without_mean(&depths, &inside, w);
-        let at = |x: usize, y: usize| found[y * w + x];
-        // The bump's mean over 15 pixels is 9 / (9 + 225) of its height.
-        assert!((at(60, 100) - 0.01 * (1.0 - 9.0 / 234.0)).abs() < 1e-4, "{}", at(60, 100));
-        assert!(at(25, 20).abs() < 1e-6 && at(0, 0) == 0.0 && at(60, 5) == 0.0);
+        let found: Vec<f32> = (0..h * w).map(|i| if is_inside(i) { bump(i) } else { 0.0 }).collect();
         let cells = cells(&found, &inside, w);
         let weight = |x: usize, y: usize| {
             let middle = [y / CELL * CELL + CELL / 2, x / CELL * CELL + CELL / 2];
@@ -201,15 +176,15 @@ mod tests {
         };
         assert_eq!(weight(0, 0), None);
         // The head counts more often, then the bump.
-        assert!(weight(60, 20).is_some_and(|head| (head - HEAD.1 * LEAST).abs() < 1e-5));
-        assert!(weight(60, 100) > weight(30, 140).map(|plain| 2.0 * plain));
+        assert!(weight(120, 40).is_some_and(|head| (head - HEAD.1 * LEAST).abs() < 1e-5));
+        assert!(weight(120, 200) > weight(60, 280).map(|plain| 2.0 * plain));
         let mut random = stream("a test of windows");
-        let places: Vec<_> = (0..200).flat_map(|_| draw(&cells, [h, w], &mut random)).collect();
-        assert!(places.iter().all(|[row, column]| row + SIDE <= h && column + SIDE <= w));
-        let of_head = places.iter().filter(|[row, _]| *row < 10).count() as f64 / places.len() as f64;
+        let places: Vec<_> = (0..200).flat_map(|_| draw(&cells, [h, w], 2, &mut random)).collect();
+        assert!(places.iter().all(|[row, column]| row % 2 == 0 && row + SIDE <= h && column + SIDE <= w));
+        let of_head = places.iter().filter(|[row, _]| *row < 20).count() as f64 / places.len() as f64;
         assert!((0.4..0.9).contains(&of_head), "{of_head}");
         // Smaller pictures, and pictures of nobody.
-        assert_eq!(draw(&cells, [64, 64], &mut random), [[0; 2]; WINDOWS]);
-        assert_eq!(draw(&[], [h, w], &mut random), [[0; 2]; WINDOWS]);
+        assert_eq!(draw(&cells, [64, 64], 2, &mut random), [[0; 2]; WINDOWS]);
+        assert_eq!(draw(&[], [h, w], 2, &mut random), [[0; 2]; WINDOWS]);
     }
 }

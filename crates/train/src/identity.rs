@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use snapsnap_base::FileError;
-use snapsnap_base::config::{Schema, differences, is_gone, keys};
+use snapsnap_base::config::{differences, keys};
 use snapsnap_data::dataset::Split::{self, Train, Val};
 
 use crate::TrainError;
@@ -69,13 +69,6 @@ impl Identity {
         });
         let (data, validated) = (fingerprints(&[Train, Val])?, fingerprints(&[Val])?);
         Ok(Self { config: own, data, validated, predictor })
-    }
-
-    /// This identity without the keys that the config no longer has, if they mean what `config` does.
-    pub fn current(mut self, config: &TrainConfig) -> Self {
-        self.config
-            .retain(|key, value| !is_gone::<TrainConfig>(key, value) || config.contradicts(key, value));
-        self
     }
 
     /// Differences from the identity `there`.

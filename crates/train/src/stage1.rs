@@ -59,12 +59,11 @@ impl PointTask {
         })
     }
 
-    /// Predictions in the window around `extent`.
+    /// Predictions for people in the box `extent`.
     fn predict(&self, networks: &Networks, batch: &Stage1Batch, extent: Option<Window>) -> Prediction {
         let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
-        let window = Window::of_predictor(&self.networks, extent);
         let images = batch.images.clone();
-        Prediction::new(predictor, &self.networks, images, &batch.masks, window, &mut Record::default())
+        Prediction::new(predictor, &self.networks, images, &batch.masks, extent, &mut Record::default())
     }
 
     /// Predicted maps of a sample on the whole canvas.

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_base::config::Schema;
+use snapsnap_net::Prediction;
 use snapsnap_net::config::{Config, Precision};
 use snapsnap_net::steps::Record;
 use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
-use snapsnap_net::{Prediction, Window};
 use snapsnap_tests::{
     FIXTURE_VALUES, Numbers, data, device, fixture, is_software, relative_error, start_error, toml_config,
     values,
@@ -84,9 +84,8 @@ fn follow(steps: usize) {
         let photographs = masks.clone().narrow(0, sample, 1).narrow(1, 0, 2);
         let predictor = networks.predictor.as_ref().expect("is trained");
         let images = images.clone().narrow(0, sample, 1);
-        let window = Window::of_predictor(&config, None);
         let prediction =
-            Prediction::new(predictor, &config, images, &photographs, window, &mut Record::default());
+            Prediction::new(predictor, &config, images, &photographs, None, &mut Record::default());
         let [truth, masks] = [
             truth.clone().narrow(0, sample, 1).reshape([-1]),
             masks.clone().narrow(0, sample, 1).reshape([-1]),

@@ -29,21 +29,19 @@ pub struct Augment {
     /// through soft or too large masks. In stage 2, targets have a random colour behind the person instead of black.
     #[serde(skip)]
     pub is_photographic: bool,
-    /// Stage 1: whether half of the samples are mirrored.
-    pub flip: bool,
 }
 
 impl Default for Augment {
     /// Augmentation of this program's own trainings.
     fn default() -> Self {
-        Self { exposure: 0.15, mask_erosion: 1.5, mask_dilation: 1.5, is_photographic: true, flip: false }
+        Self { exposure: 0.15, mask_erosion: 1.5, mask_dilation: 1.5, is_photographic: true }
     }
 }
 
 impl Augment {
     /// No augmentation.
     pub fn none() -> Self {
-        Self { exposure: 0.0, mask_erosion: 0.0, mask_dilation: 0.0, is_photographic: false, flip: false }
+        Self { exposure: 0.0, mask_erosion: 0.0, mask_dilation: 0.0, is_photographic: false }
     }
 
     pub(super) fn problem(&self) -> Option<(&'static str, String)> {

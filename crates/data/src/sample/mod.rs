@@ -143,7 +143,6 @@ impl SampleConfig {
         let beside_neighbours = [
             ("placed_share", "must be 0", self.placed_share > 0.0),
             ("upright", "must be false", self.upright),
-            ("augment.flip", "must be false", self.augment.flip),
         ];
         let is_pair = self.pair_degrees == OPPOSITE;
         if let Some((key, message, _)) = beside_neighbours.into_iter().find(|(.., wrong)| !is_pair && *wrong)

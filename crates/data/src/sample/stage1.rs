@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use rand::Rng;
 
 use super::four_views::FourViews;
 use super::{SampleConfig, Source, Stage};
@@ -76,31 +75,7 @@ impl Stage1Item {
         let images = photographs.each_ref().map(|photo| &*photo.rgb).concat();
         let masks = photographs.each_ref().map(|photo| &*photo.mask).concat();
         let name = format!("{}: {}, view {front}", source.folder.root().display(), person.name);
-        let mut item = Self { name, side, images, masks, points, valid };
-        if source.config.augment.flip && random.random() {
-            item.flip();
-        }
-        Ok(item)
-    }
-
-    /// Mirrors the sample in x, and swaps the two sides.
-    fn flip(&mut self) {
-        let (side, area) = (self.side, self.side * self.side);
-        for image in [&mut self.images, &mut self.masks, &mut self.valid] {
-            image.chunks_exact_mut(side).for_each(<[f32]>::reverse);
-        }
-        for line in self.points.chunks_exact_mut(3 * side) {
-            let (points, _) = line.as_chunks_mut::<3>();
-            points.reverse();
-            points.iter_mut().for_each(|point| point[0] = -point[0]);
-        }
-        // Views 2 and 3 are right and left, 4 and 5 their second surfaces.
-        for (maps, size) in [(&mut self.points, 3 * area), (&mut self.valid, area)] {
-            for pair in maps[2 * size..].chunks_exact_mut(2 * size) {
-                let (right, left) = pair.split_at_mut(size);
-                right.swap_with_slice(left);
-            }
-        }
+        Ok(Self { name, side, images, masks, points, valid })
     }
 }
 

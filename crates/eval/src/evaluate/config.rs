@@ -256,8 +256,6 @@ fn on_device(name: &str) -> String {
 }
 
 impl Schema for EvalConfig {
-    const RENAMED: &'static [(&'static str, &'static str)] = &[("photographs.place", "photographs.road")];
-
     fn refusal(&self) -> Option<(String, String)> {
         let of_ablation = |(name, ablation): (&String, &Variant)| {
             let of_benchmarks = |key| (key, "only settings of `snapsnap bench` have this key".to_owned());

@@ -1,10 +1,10 @@
 //! The refused values and combinations of values of a config.
 
-use snapsnap_base::config::{Removed, outside};
+use snapsnap_base::config::outside;
 
 use super::{
     Anchor, Body, CELL, COLOR_LIMITS, Config, Downsample, HULL_REACH, HeadKind, LEAST_OPACITIES, OPPOSITE,
-    RegressorStart, RotationFrame, Sides, Upsample, WorldFrame,
+    PATCH, RegressorStart, RotationFrame, Sides, Upsample, WorldFrame,
 };
 
 /// Largest number of parameters: seven times the published size, 16 GB of f32.
@@ -12,23 +12,6 @@ const MAX_PARAMETERS: usize = 4_000_000_000;
 
 /// A key and the reason why its value is refused.
 type Problem = (&'static str, String);
-
-impl Config {
-    /// The keys of [`snapsnap_base::config::Schema::REMOVED`], public for configs that contain this config.
-    pub const GONE: Removed = &[
-        ("network.drop_empty", &["false"]),
-        ("network.mlp_ratio", &["4"]),
-        ("network.normals", &["false"]),
-        ("network.rope_base", &["100.0"]),
-        ("network.steepest", &["4.0"]),
-        ("regressor.channels", &["16"]),
-        // As `regressor.start`: the network's own colours, or corrected colours of the pixels.
-        ("regressor.color", &["\"free\"", "\"residual\""]),
-        ("regressor.groups", &["16"]),
-        // With a geometric start, colours are always straight.
-        ("regressor.straight_color", &["true", "false"]),
-    ];
-}
 
 impl Config {
     /// The first refused key, and the reason. `parameters` counts the parameters of networks whose sizes are in their
@@ -109,9 +92,9 @@ impl Config {
             n.details.as_ref().map(|details| details.resolution).filter(|size| *size <= n.resolution);
         // Windows are whole patches of the predictor's input.
         let is_detailed = details.is_none_or(|size| {
-            size.is_multiple_of(n.net_resolution)
+            size.is_multiple_of(PATCH * n.net_resolution)
                 && n.resolution.is_multiple_of(size)
-                && (n.patch * size / n.net_resolution).is_multiple_of(CELL)
+                && (n.patch * size / n.net_resolution).is_multiple_of(PATCH * CELL)
         });
         let problems = [
             (
@@ -159,9 +142,11 @@ impl Config {
                 "network.details.resolution",
                 !is_detailed,
                 format!(
-                    "must be a multiple of `network.net_resolution` ({}) and divide `network.resolution` ({}); a patch \
-                     must have a multiple of {CELL} of its pixels",
-                    n.net_resolution, n.resolution
+                    "must be a multiple of twice `network.net_resolution` ({}) and divide `network.resolution` ({}); a \
+                     patch must have a multiple of {} of its pixels",
+                    n.net_resolution,
+                    n.resolution,
+                    PATCH * CELL
                 ),
             ),
             // The mirror image of the second photograph belongs to a camera at minus this angle.

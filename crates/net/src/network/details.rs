@@ -2,27 +2,33 @@
 //! predictor does, moves their points along their rays. It has no attention, so that a pixel's result depends on its
 //! surroundings alone.
 
+use std::ops::Range;
+
 use burn::module::Module;
 use burn::tensor::module::avg_pool2d;
 use burn::tensor::ops::AvgPoolOptions;
 use burn::tensor::{Device, Tensor};
 
+use snapsnap_ops::bilinear;
+
 use super::View;
 use super::predictor::{PointMap, PointPredictor, enlarged};
 use super::rays::Rays;
 use super::unet::{UNet, UNetSizes};
-use crate::config::{DetailsConfig, Downsample, OPPOSITE};
+use crate::config::{DetailsConfig, Downsample, OPPOSITE, PATCH};
 use crate::resample::shrink;
 use crate::window::Window;
 
-/// Channels of the input: colours, mask, distance of the points from the plane through the body's axis, its difference
+/// Channels of the input: colours and masks of a patch, distance of the points from the plane through the body's axis, its difference
 /// from the mean nearby, the other photograph's distance and mask at the same place of the body, front or back, and the
 /// place on the plane.
-const INPUTS: usize = 3 + 1 + 2 + 2 + 1 + 2;
+const INPUTS: usize = (3 + 1) * PATCH * PATCH + 2 + 2 + 1 + 2;
 /// Network units per unit of the differences from the mean nearby and of the network's output: with a δ of 0.2, 1 cm.
 const UNIT: f64 = 0.05;
 /// Number and side of the means that make the mean nearby. At 128 pixels its standard deviation is 7 cm.
 const MEANS: (usize, usize) = (4, 7);
+/// Least share of the person in a pixel whose mean is taken.
+const MIN_SHARE: f64 = 1e-3;
 /// Channels of the features before the last layer.
 const LAST_DIM: usize = 16;
 
@@ -38,7 +44,7 @@ impl Details {
     pub(super) fn new(config: &DetailsConfig, device: &Device) -> Self {
         let sizes = UNetSizes {
             inputs: INPUTS,
-            outputs: 1,
+            outputs: PATCH * PATCH,
             widths: config.dims,
             blocks: [config.dims[3], 0, 1],
             stride: 1,
@@ -47,18 +53,33 @@ impl Details {
         Self { body: UNet::new(&sizes, device), resolution: config.resolution }
     }
 
-    /// Movements along the rays `[N, 1, h, w]`, in network units.
+    /// Movements along the rays `[N, 1, PATCH·h, PATCH·w]`, in network units.
     pub(super) fn relief(&self, images: Tensor<4>) -> Tensor<4> {
         let levels = self.body.encode(images, None);
-        self.body.decoder.out(self.body.features(&levels)) * UNIT
+        joined(self.body.decoder.out(self.body.features(&levels))) * UNIT
     }
+}
+
+/// The pixels of each patch as channels: `[B, C, h, w]` → `[B, C·PATCH², h/PATCH, w/PATCH]`.
+fn patches(x: Tensor<4>) -> Tensor<4> {
+    let [b, c, h, w] = x.dims();
+    let (h, w) = (h / PATCH, w / PATCH);
+    let split = x.reshape([b, c, h, PATCH, w, PATCH]).permute([0, 1, 3, 5, 2, 4]);
+    split.reshape([b, c * PATCH * PATCH, h, w])
+}
+
+/// Channels as the pixels of each patch: `[B, PATCH², h, w]` → `[B, 1, PATCH·h, PATCH·w]`.
+fn joined(x: Tensor<4>) -> Tensor<4> {
+    let [b, _, h, w] = x.dims();
+    let rows = x.reshape([b, PATCH, PATCH, h, w]).permute([0, 3, 1, 4, 2]);
+    rows.reshape([b, 1, PATCH * h, PATCH * w])
 }
 
 /// What the network of details sees of both photographs.
 pub struct SecondLook {
-    /// `[2·B, INPUTS, h, w]`, all fronts, then all backs.
+    /// `[2·B, INPUTS, h/PATCH, w/PATCH]`, all fronts, then all backs.
     pub images: Tensor<4>,
-    /// Enlarged maps of front and back, in network units and without anchors.
+    /// Maps of front and back, enlarged to h × w, in network units and without anchors.
     maps: [PointMap; 2],
     /// Each photograph's share of the person `[B, 1, h, w]`.
     masks: [Tensor<4>; 2],
@@ -68,7 +89,8 @@ pub struct SecondLook {
 impl PointPredictor {
     /// Refines the maps of front and back, in network units and without anchors (docs/method.md, "Details"). Returns
     /// maps of `network.details.resolution`, and moves the given maps by the mean movement of the person in each pixel.
-    /// `images` `[B, 2, 3, S, S]` and `masks` `[B, 2, S, S]` are the photographs.
+    /// `images` `[B, 2, 3, S, S]` and `masks` `[B, 2, S, S]` are the photographs. Only the `columns` of the window's image
+    /// show the person; they are symmetric and whole patches.
     ///
     /// # Panics
     /// Without a network of details.
@@ -78,20 +100,23 @@ impl PointPredictor {
         images: &Tensor<5>,
         masks: &Tensor<4>,
         window: &Window,
+        columns: Range<usize>,
     ) -> Vec<(View, PointMap)> {
         let [canvas, coarse] = [self.config.resolution, self.config.net_resolution];
         let fine = self.details.as_ref().expect("a network of details").resolution;
         let look = self.second_look(maps, images, masks, window);
-        let relief = self.relief(look.images);
-        let b = relief.dims()[0] / 2;
+        let [h, w] = look.size();
+        let shown = look.images.narrow(3, columns.start / PATCH, columns.len() / PATCH);
+        let n = shown.dims()[0];
+        let relief = Tensor::zeros([n, 1, h, w], &shown.device())
+            .slice_assign([0..n, 0..1, 0..h, columns], self.relief(shown));
+        let b = n / 2;
         let reliefs = [0, b].map(|from| relief.clone().narrow(0, from, b));
         let moved = |map: PointMap, relief: Tensor<4>, rays: &Rays| PointMap {
             points: map.points + rays.directions.clone() * relief.permute([0, 2, 3, 1]),
             ..map
         };
         for (i, (view, map)) in maps.iter_mut().take(2).enumerate() {
-            /// Least share of the person in a pixel that is moved.
-            const MIN_SHARE: f64 = 1e-3;
             let small = |x: Tensor<4>| shrink(x, fine / coarse, Downsample::Area);
             let mask = look.masks[i].clone();
             let mean = small(reliefs[i].clone() * mask.clone()) / small(mask).clamp_min(MIN_SHARE);
@@ -119,14 +144,19 @@ impl PointPredictor {
         let small = |x: Tensor<4>, size: usize| shrink(window.cut(x), canvas / size, Downsample::Area);
         let mask = |view: usize, size: usize| small(masks.clone().narrow(1, view, 1), size);
         let colors = [0, 1].map(|view| small(images.clone().narrow(1, view, 1).squeeze_dim(1), fine));
-        let larger = |map: PointMap, view: usize| enlarged(map, fine / coarse, Some(mask(view, coarse)));
-        let large = [0, 1].map(|view| larger(maps[view].1.clone(), view));
-        let smooth = [0, 1].map(|view| larger(smoothed(&maps[view].1, &mask(view, coarse)), view));
+        let larger =
+            |map: PointMap, view: usize, size: usize| enlarged(map, size / coarse, Some(mask(view, coarse)));
+        let map = |view: usize| maps[view].1.clone();
+        let input = |view: usize| {
+            let nearby = mean_nearby(&maps[view].1, &mask(view, coarse));
+            [map(view), nearby].map(|map| larger(map, view, fine / PATCH))
+        };
+        let large = [0, 1].map(|view| larger(map(view), view, fine));
         let masks = [mask(0, fine), mask(1, fine)];
-        SecondLook::new(large, smooth, colors, masks, &window.shrunk(canvas / fine), fine)
+        SecondLook::new(large, [input(0), input(1)], colors, masks, &window.shrunk(canvas / fine), fine)
     }
 
-    /// Movements along the rays `[N, 1, h, w]`, in network units, for images of a [`SecondLook`] or for parts of them.
+    /// Movements along the rays `[N, 1, PATCH·h, PATCH·w]`, in network units, for images `[N, INPUTS, h, w]` of a [`SecondLook`] or for parts of them.
     /// A movement of 1 changes the depth by one unit.
     ///
     /// # Panics
@@ -137,53 +167,75 @@ impl PointPredictor {
 }
 
 /// Points with the mean of the person's points nearby, by its share of each pixel `[B, 1, h, w]`.
-fn smoothed(map: &PointMap, mask: &Tensor<4>) -> PointMap {
+fn mean_nearby(map: &PointMap, mask: &Tensor<4>) -> PointMap {
+    let points = means(map.points.clone().permute([0, 3, 1, 2]), mask);
+    PointMap { points: points.permute([0, 2, 3, 1]), conf: map.conf.clone() }
+}
+
+/// Means of the person's values nearby `[B, C, h, w]`, by its share of each pixel `[B, 1, h, w]`.
+fn means(x: Tensor<4>, mask: &Tensor<4>) -> Tensor<4> {
     let mean = |x: Tensor<4>| {
         let options = || AvgPoolOptions::new([MEANS.1; 2]).with_stride([1, 1]).with_padding([MEANS.1 / 2; 2]);
         (0..MEANS.0).fold(x, |x, _| avg_pool2d(x, options()))
     };
-    /// Least share of the person nearby.
-    const MIN_SHARE: f64 = 1e-3;
-    let outside = mask.clone().lower_equal_elem(0.0);
-    let points = map.points.clone().permute([0, 3, 1, 2]);
-    // Points of the background may be anything.
-    let points = (points * mask.clone())
-        .mask_fill(outside.expand(map.points.clone().permute([0, 3, 1, 2]).dims()), 0.0);
-    let mean = mean(points) / mean(mask.clone()).clamp_min(MIN_SHARE);
-    PointMap { points: mean.permute([0, 2, 3, 1]), conf: map.conf.clone() }
+    // Values of the background may be anything.
+    let outside = mask.clone().lower_equal_elem(0.0).expand(x.dims());
+    mean((x * mask.clone()).mask_fill(outside, 0.0)) / mean(mask.clone()).clamp_min(MIN_SHARE)
+}
+
+/// Values `[B, 1, h, w]` minus the mean of the person's values nearby; 0 outside of the person. `inside` is 1 or 0, and
+/// `factor` is the number of its pixels per pixel of the predictor, along an axis.
+pub fn without_mean(x: Tensor<4>, inside: &Tensor<4>, factor: usize) -> Tensor<4> {
+    let [_, _, h, w] = x.dims();
+    let x = x.mask_fill(inside.clone().lower_equal_elem(0.5), 0.0);
+    let small = |x: Tensor<4>| shrink(x, factor, Downsample::Area);
+    let share = small(inside.clone());
+    let mean = means(small(x.clone()) / share.clone().clamp_min(MIN_SHARE), &share);
+    (x - bilinear(mean, [h, w], false)) * inside.clone()
 }
 
 impl SecondLook {
-    /// `colors` are `[B, 3, h, w]` in [−1, 1]. The `window` of a canvas of `side`² pixels is symmetric. `smooth` are the
-    /// maps with the means nearby.
+    /// `colors` are `[B, 3, h, w]` in [−1, 1]. The `window` of a canvas of `side`² pixels is symmetric. `inputs` are each
+    /// photograph's points and means nearby, enlarged to h/PATCH × w/PATCH.
     pub(super) fn new(
         maps: [PointMap; 2],
-        smooth: [PointMap; 2],
+        inputs: [[PointMap; 2]; 2],
         colors: [Tensor<4>; 2],
         masks: [Tensor<4>; 2],
         window: &Window,
         side: usize,
     ) -> Self {
-        let ([b, _, h, w], device) = (masks[0].dims(), masks[0].device());
-        let rays = [View::Front, View::Back].map(|view| Rays::new(view, OPPOSITE, side, window, &device));
-        let distances = [&maps, &smooth].map(|maps| {
-            [0, 1].map(|i| {
-                let distance = (maps[i].points.clone() * rays[i].forward.clone()).sum_dim(3);
-                let outside = masks[i].clone().lower_equal_elem(0.0);
-                (distance.permute([0, 3, 1, 2]) * masks[i].clone()).mask_fill(outside, 0.0)
+        let device = masks[0].device();
+        let rays = |side: usize, window: &Window| {
+            [View::Front, View::Back].map(|view| Rays::new(view, OPPOSITE, side, window, &device))
+        };
+        let coarse_rays = rays(side / PATCH, &window.shrunk(PATCH));
+        let coarse = masks.clone().map(|mask| shrink(mask, PATCH, Downsample::Area));
+        let [b, _, h, w] = coarse[0].dims();
+        let distances = [0, 1].map(|i| {
+            let outside = coarse[i].clone().lower_equal_elem(0.0);
+            inputs[i].each_ref().map(|map| {
+                let distance = (map.points.clone() * coarse_rays[i].forward.clone()).sum_dim(3);
+                (distance.permute([0, 3, 1, 2]) * coarse[i].clone()).mask_fill(outside.clone(), 0.0)
             })
         });
-        let [distances, smooth] = distances;
         let images = [0, 1].map(|i| {
-            let place = rays[i].anchors().narrow(3, 0, 2).permute([0, 3, 1, 2]).expand([b, 2, h, w]);
+            let place = coarse_rays[i].anchors().narrow(3, 0, 2).permute([0, 3, 1, 2]).expand([b, 2, h, w]);
             let is_back = Tensor::full([b, 1, h, w], i as f32, &device);
             // The plane through the axis shows the same place of the body to mirrored pixels of the other photograph.
-            let [other, other_mask] = [&distances[1 - i], &masks[1 - i]].map(|x| x.clone().flip([3]));
-            let relief = (distances[i].clone() - smooth[i].clone()) / UNIT;
-            let own = [colors[i].clone(), masks[i].clone(), distances[i].clone(), relief];
-            Tensor::cat(own.into_iter().chain([other, other_mask, is_back, place]).collect(), 1)
+            let [other, other_mask] = [&distances[1 - i][0], &coarse[1 - i]].map(|x| x.clone().flip([3]));
+            let [distance, nearby] = distances[i].clone();
+            let relief = (distance.clone() - nearby) / UNIT;
+            let [colors, mask] = [&colors[i], &masks[i]].map(|x| patches(x.clone()));
+            Tensor::cat(vec![colors, mask, distance, relief, other, other_mask, is_back, place], 1)
         });
-        Self { images: Tensor::cat(images.to_vec(), 0), maps, masks, rays }
+        Self { images: Tensor::cat(images.to_vec(), 0), maps, masks, rays: rays(side, window) }
+    }
+
+    /// h and w.
+    pub fn size(&self) -> [usize; 2] {
+        let [_, _, h, w] = self.masks[0].dims();
+        [h, w]
     }
 
     /// Depths `[2·B, 1, h, w]` in metres by which `points` of front and back `[B, h, w, 3]`, metres in the front
@@ -259,7 +311,7 @@ mod tests {
 
     #[test]
     fn details_that_move_nothing_leave_all_points_in_place() {
-        let (plain, same_size) = (config(None), config(Some(SIDE / 2)));
+        let (plain, same_size) = (config(None), config(Some(SIDE)));
         let expected = predicted(&plain, &random_predictor(&plain, 3, &Device::flex()));
         assert_eq!(predicted(&same_size, &moving(&same_size, 0.0)), expected);
     }
@@ -284,6 +336,21 @@ mod tests {
     }
 
     #[test]
+    fn channels_are_the_pixels_of_patches() {
+        let device = Device::flex();
+        let values: Vec<f32> = (0..2 * 4 * 6).map(|i| i as f32).collect();
+        let image = Tensor::<4>::from_data(TensorData::new(values, [1, 2, 4, 6]), &device);
+        let split = patches(image.clone());
+        assert_eq!(split.dims(), [1, 8, 2, 3]);
+        for (i, value) in host(split.clone()).into_iter().enumerate() {
+            let (channel, [row, column]) = (i / 6, [i % 6 / 3, i % 3]);
+            let (of, [y, x]) = (channel / 4, [channel % 4 / 2, channel % 2]);
+            assert_eq!(value, (24 * of + 6 * (2 * row + y) + 2 * column + x) as f32);
+        }
+        assert_eq!(host(joined(split.narrow(1, 0, 4))), host(image.narrow(1, 0, 1)));
+    }
+
+    #[test]
     fn depths_behind_are_measured_in_each_photographs_camera() {
         let device = Device::flex();
         let window = Window::whole(SIDE);
@@ -295,17 +362,22 @@ mod tests {
             conf: Tensor::ones([1, SIDE, SIDE], &device),
         };
         let maps = [map(1), map(2)];
+        let nothing = || PointMap {
+            points: Tensor::zeros([1, SIDE / PATCH, SIDE / PATCH, 3], &device),
+            conf: Tensor::ones([1, SIDE / PATCH, SIDE / PATCH], &device),
+        };
+        let inputs = || [nothing(), nothing()];
         let mask = || Tensor::ones([1, 1, SIDE, SIDE], &device);
         let colors = || Tensor::zeros([1, 3, SIDE, SIDE], &device);
         let look = SecondLook::new(
             maps.clone(),
-            maps.clone(),
+            [inputs(), inputs()],
             [colors(), colors()],
             [mask(), mask()],
             &window,
             SIDE,
         );
-        assert_eq!(look.images.dims(), [2, INPUTS, SIDE, SIDE]);
+        assert_eq!(look.images.dims(), [2, INPUTS, SIDE / PATCH, SIDE / PATCH]);
         let points = [(View::Front, 0.03), (View::Back, -0.05)].map(|(view, depth)| {
             let rays = Rays::new(view, OPPOSITE, SIDE, &window, &device);
             rays.anchors() + maps[view as usize].points.clone() * 0.2 + rays.directions * depth

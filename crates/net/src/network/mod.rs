@@ -19,7 +19,7 @@ mod view;
 use burn::tensor::Device;
 use snapsnap_ops::Rope;
 
-pub use details::SecondLook;
+pub use details::{SecondLook, without_mean};
 pub(crate) use dpt::{conv1x1, conv3x3};
 pub use dust3r::TokenMaps;
 pub use input::Input;

@@ -3,7 +3,6 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
-use snapsnap_base::config::Removed;
 
 use crate::config::{Config, RegressorStart, Schema};
 use crate::network::PointPredictor;
@@ -82,13 +81,6 @@ pub fn tensors(config: &Config) -> Vec<TensorSpec> {
 
 // Here, since the networks know the config, and not the other way round.
 impl Schema for Config {
-    const REMOVED: &'static [Removed] = &[Self::GONE];
-
-    fn contradicts(&self, key: &str, value: &str) -> bool {
-        key == "regressor.color"
-            && (value == "\"residual\"") != (self.regressor.start() == RegressorStart::Geometric)
-    }
-
     fn refusal(&self) -> Option<(String, String)> {
         self.refused(|| tensors(self).iter().map(TensorSpec::elements).sum())
     }

@@ -70,9 +70,7 @@ fn samples_without_sides_are_those_with_sides_without_them() {
     let (_temporary, folder) = data_of_armed(side);
     let area = (side * side) as usize;
     for (placed_share, upright) in [(0.0, false), (1.0, true)] {
-        let augment = Augment { flip: true, ..Augment::default() };
-        let with =
-            SampleConfig { second_depth: true, placed_share, upright, augment, ..SampleConfig::default() };
+        let with = SampleConfig { second_depth: true, placed_share, upright, ..SampleConfig::default() };
         let without = stage1(&folder, SampleConfig { sides: false, ..with.clone() });
         let with = stage1(&folder, with);
         for index in 0..8 {
