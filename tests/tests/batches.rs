@@ -176,6 +176,7 @@ fn wrong_batches_are_refused() {
         ("front,back\na\n", "found record with 1 fields"),
         ("front,back\na,\n", "line 2: needs a front and a back"),
         ("front,back\nfront.png,back.png\n", "line 2: needs a name"),
+        ("name,front,back\r\na,b,c\r\n\r\nd,e,\r\n", "line 4: needs a front and a back"),
         ("name,front,back\n../a,b,c\n", "`../a` cannot be the name"),
         ("name,front,back\nCON,b,c\n", "`CON` cannot be the name"),
         ("name,front,back\na,b,\"c\nd,e,f\n", "is a quotation mark missing?"),

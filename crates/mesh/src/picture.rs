@@ -124,6 +124,7 @@ fn decode_from(
         });
     }
     let reader = ImageReader::new(source).with_guessed_format().map_err(FileError::read(path))?;
+    let is_bmp = reader.format() == Some(ImageFormat::Bmp);
     let (picture, orientation, icc) = if reader.format() == Some(ImageFormat::Jpeg) {
         let bytes = whole(path, reader.into_inner())?;
         let jpeg = jpeg::Jpeg::open(&bytes).map_err(&failed)?;
@@ -137,6 +138,11 @@ fn decode_from(
         let icc = decoder.icc_profile().ok().flatten();
         (DynamicImage::from_decoder(decoder).map_err(&failed)?, orientation, icc)
     };
+    // The fourth byte of screenshots means nothing.
+    let is_invisible = |picture: &DynamicImage| {
+        picture.color().has_alpha() && picture.to_rgba8().pixels().all(|pixel| pixel.0[3] == 0)
+    };
+    let picture = if is_bmp && is_invisible(&picture) { picture.into_rgb8().into() } else { picture };
     let mut picture = if in_srgb { profile::to_srgb(picture, icc.as_deref()) } else { picture };
     picture.apply_orientation(orientation);
     Ok(picture)

@@ -1,5 +1,6 @@
 //! The networks of snapsnap (two photographs → point maps → Gaussians) and their weight files.
 
+mod backing;
 pub mod blazepose;
 mod closed_top;
 pub mod config;

@@ -108,6 +108,11 @@ pub enum Step {
         /// Their number.
         gaussians: usize,
     },
+    /// Gaussians behind the surface.
+    Backing {
+        /// Their number.
+        gaussians: usize,
+    },
     /// Several pairs of photographs were reconstructed. The other steps belong to the first pair.
     Pairs {
         /// Their number.
@@ -173,6 +178,7 @@ impl fmt::Display for Step {
             Self::OffSurface { gaussians } => {
                 write!(f, "{gaussians} Gaussians left out: they hang off the person's surface")
             }
+            Self::Backing { gaussians } => write!(f, "backing: {gaussians} Gaussians behind the surface"),
             Self::GaussiansNotFinite { gaussians } => {
                 write!(f, "{gaussians} Gaussians left out: their attributes are not finite")
             }

@@ -70,7 +70,9 @@ impl Stored {
             Problem::Io(source) => cannot(source),
             Problem::Content(problem) => FileError::unsuitable(path, problem),
         });
-        Ok(read?)
+        let mut read = read?;
+        read.limit();
+        Ok(read)
     }
 
     /// Writes a file of the kind of `path`'s extension, whole or not at all.

@@ -1,6 +1,7 @@
 //! Gaussians as files store them: before activation, column by column.
 
 use std::io;
+use std::ops::RangeInclusive;
 
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -8,6 +9,8 @@ use crate::{Camera, Gaussians, SplatError, sh};
 
 /// Least distance of a stored opacity from 0 and from 1, whose logits are infinite.
 const OPACITY_MARGIN: f32 = 1e-6;
+/// Lengths of quaternions that a render normalises; others have no rotation, or are no numbers.
+const DRAWN_ROTATIONS: RangeInclusive<f64> = 1e-5..=1e17;
 /// Least scale that is stored, metres: the logarithm of a scale that underflowed to 0 is infinite.
 pub(crate) const MIN_SCALE: f32 = 1e-10;
 
@@ -119,9 +122,36 @@ impl Stored {
         }
     }
 
-    /// Drops every Gaussian with a value that is not finite; returns the number of dropped Gaussians.
-    pub fn drop_not_finite(&mut self) -> usize {
-        let whole = |i: usize| self.columns.iter().all(|column| column[i].is_finite());
+    /// Values that other programs' files have: logits of the opacities 0 and 1, logarithms of the scale 0, and
+    /// quaternions so short or long that a render takes them for damage. They become what [`Self::of`] makes of them.
+    pub(crate) fn limit(&mut self) {
+        for (column, value) in self.columns[7..11].iter_mut().enumerate() {
+            let is_opacity = column == 3;
+            for value in value.iter_mut().filter(|value| value.is_infinite()) {
+                match (is_opacity, *value > 0.0) {
+                    (true, is_solid) => *value = logit(f32::from(u8::from(is_solid))),
+                    (false, false) => *value = MIN_SCALE.ln(),
+                    // An infinite size.
+                    (false, true) => {}
+                }
+            }
+        }
+        for i in 0..self.len() {
+            let q = [3, 4, 5, 6].map(|column| self.columns[column][i]);
+            let length = length(q);
+            if length > 0.0 && !DRAWN_ROTATIONS.contains(&length) {
+                unit(q).into_iter().enumerate().for_each(|(at, value)| self.columns[3 + at][i] = value);
+            }
+        }
+    }
+
+    /// Drops every Gaussian that cannot be drawn: with a value that is not finite, or a quaternion of length 0. Returns
+    /// the number of dropped Gaussians.
+    pub fn drop_undrawable(&mut self) -> usize {
+        let whole = |i: usize| {
+            self.columns.iter().all(|column| column[i].is_finite())
+                && (3..7).any(|column| self.columns[column][i] != 0.0)
+        };
         let kept: Vec<bool> = (0..self.len()).map(whole).collect();
         for column in &mut self.columns {
             let mut kept = kept.iter();
@@ -174,9 +204,13 @@ impl From<String> for Problem {
     }
 }
 
+fn length(q: [f32; 4]) -> f64 {
+    q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt()
+}
+
 /// A quaternion (w, x, y, z), normalised. A quaternion of length 0 becomes the identity.
 pub(crate) fn unit(q: [f32; 4]) -> [f32; 4] {
-    let length = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    let length = length(q);
     if length > 0.0 { q.map(|v| (f64::from(v) / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] }
 }
 

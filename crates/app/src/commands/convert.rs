@@ -67,16 +67,12 @@ fn one(input: &Path, output: &Path, axes: &AxesArguments) -> Result<(), Failure>
     check_kind(output)?;
     axes.check(output)?;
     check_outputs(&[output], &[input])?;
-    let (stored, dropped) = finite(input)?;
+    let stored = read(input)?;
     axes.write(&stored, output)?;
     if say::is_quiet() {
         return Ok(());
     }
     let say = say::beside(output);
-    if dropped > 0 {
-        let input = input.display();
-        say(&format!("{input}: {dropped} Gaussians with values that are not finite were left out"));
-    }
     for loss in stored.losses(Kind::of(output)) {
         say(&format!("{}: {loss}", output.display()));
     }
@@ -92,12 +88,27 @@ fn one(input: &Path, output: &Path, axes: &AxesArguments) -> Result<(), Failure>
     Ok(())
 }
 
-/// Reads a file's finite Gaussians, and counts the others. Refuses a file of which no Gaussian is finite.
-pub fn finite(input: &Path) -> Result<(Stored, usize), Failure> {
+/// Reads a file's Gaussians and says how many cannot be drawn and were left out.
+pub fn read(input: &Path) -> Result<Stored, Failure> {
+    let (stored, dropped) = drawable(input)?;
+    if dropped > 0 {
+        let input = input.display();
+        say::note(&format!(
+            "{input}: {dropped} Gaussians were left out: a value is not finite, or the rotation is 0"
+        ));
+    }
+    Ok(stored)
+}
+
+/// Reads a file's Gaussians that can be drawn, and counts the others. Refuses a file without a drawable Gaussian.
+pub fn drawable(input: &Path) -> Result<(Stored, usize), Failure> {
     let mut stored = Stored::read(input)?;
-    let dropped = stored.drop_not_finite();
+    let dropped = stored.drop_undrawable();
     if stored.is_empty() && dropped > 0 {
-        return Err(Failure::file(input, format_args!("none of its {dropped} Gaussians is finite")));
+        let message = format_args!(
+            "none of its {dropped} Gaussians can be drawn: values are not finite, or rotations 0"
+        );
+        return Err(Failure::file(input, message));
     }
     Ok((stored, dropped))
 }

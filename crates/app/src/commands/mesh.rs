@@ -7,8 +7,9 @@ use burn::tensor::Device;
 use clap::Args;
 use snapsnap_mesh::export::{self, Kind};
 use snapsnap_mesh::fuse::{Fused, Options, fuse};
-use snapsnap_splat::scene::{self, Loaded};
+use snapsnap_splat::scene::Loaded;
 
+use super::convert::read;
 use crate::batch::{self, ShardArgument, must_be_unused};
 use crate::failure::Failure;
 use crate::output::check_outputs;
@@ -102,7 +103,7 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
     let mut target = Target::new(&arguments.output, &arguments.surface)?;
     target.options.force = arguments.force;
     check_outputs(&target.files(), &[&arguments.input])?;
-    let loaded = scene::read(&arguments.input, device)?;
+    let loaded = read(&arguments.input)?.load(device);
     check_size(&loaded, device).map_err(|e| e.about(&arguments.input))?;
     let fused = target.write(&loaded, &arguments.input)?;
     if arguments.verbose {

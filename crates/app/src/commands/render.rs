@@ -10,11 +10,11 @@ use burn::tensor::{Device, Tensor};
 use clap::Args;
 use serde_json::json;
 use snapsnap_base::file;
-use snapsnap_splat::scene;
 use snapsnap_splat::{
     Camera, Counts, MAX_SIDE, Preset, RenderOptions, Rendered, SplatError, camera_file, render,
 };
 
+use super::convert::read;
 use crate::arguments::one_of;
 use crate::batch::{self, ShardArgument, must_be_unused};
 use crate::failure::{Failure, bail};
@@ -49,10 +49,10 @@ pub struct Arguments {
     /// Number of views around a person, the first from the front.
     #[arg(long, value_name = "N")]
     orbit: Option<usize>,
-    /// Size of the pictures [default: the cameras' own; 1024x1024 for an orbit].
+    /// Size of the pictures, or side of square ones [default: the cameras' own; 1024x1024 for an orbit].
     #[arg(long, value_name = "WxH", value_parser = size)]
     size: Option<[u32; 2]>,
-    /// Colour behind the Gaussians, each from 0 to 1.
+    /// Colour behind the Gaussians: black, grey, white, or three numbers from 0 to 1.
     #[arg(long, value_name = "R,G,B", value_parser = color, default_value = "0,0,0")]
     background: [f32; 3],
     /// Folder for 000.png, 001.png, … and cameras.json [default: renders, unless --raw is given]. Each of several
@@ -124,7 +124,7 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
         );
     }
     let start = Instant::now();
-    let loaded = scene::read(&arguments.ply, device)?;
+    let loaded = read(&arguments.ply)?.load(device);
     let reading = start.elapsed();
     let background =
         (arguments.background != [0.0; 3]).then(|| Tensor::<1>::from_floats(arguments.background, device));
@@ -330,14 +330,20 @@ fn report(say: fn(&str), n: usize, counts: &[Counts], device: &Device) {
 
 fn size(text: &str) -> Result<[u32; 2], String> {
     let side = |text: &str| text.trim().parse::<u32>().ok().filter(|side| (1..=MAX_SIDE).contains(side));
-    let sides = text.split_once(['x', 'X']).and_then(|(w, h)| Some([side(w)?, side(h)?]));
-    sides.ok_or_else(|| format!("expected WIDTHxHEIGHT, each from 1 to {MAX_SIDE} pixels"))
+    let (width, height) = text.split_once(['x', 'X']).unwrap_or((text, text));
+    let sides = side(width).zip(side(height)).map(<[u32; 2]>::from);
+    sides.ok_or_else(|| format!("expected a side, or WIDTHxHEIGHT, each from 1 to {MAX_SIDE} pixels"))
 }
 
 fn color(text: &str) -> Result<[f32; 3], String> {
+    if let Some((_, level)) =
+        [("black", 0.0), ("grey", 0.5), ("white", 1.0)].iter().find(|(name, _)| *name == text)
+    {
+        return Ok([*level; 3]);
+    }
     let channel = |text: &str| text.trim().parse::<f32>().ok().filter(|c| (0.0..=1.0).contains(c));
     let channels: Option<Vec<f32>> = text.split(',').map(channel).collect();
     channels
         .and_then(|channels| channels.try_into().ok())
-        .ok_or_else(|| "expected three numbers from 0 to 1, for example 1,1,1".into())
+        .ok_or_else(|| "expected black, grey, white or three numbers from 0 to 1, for example 1,1,1".into())
 }

@@ -10,7 +10,7 @@ use clap::Args;
 use snapsnap_base::FileError;
 use ureq::http::StatusCode;
 
-use super::convert::finite;
+use super::convert::{drawable, read};
 use crate::downloads::{self, Download};
 use crate::failure::Failure;
 use crate::page::{self, PageArguments, busy, text};
@@ -42,7 +42,7 @@ static FORMER: Mutex<Vec<Weak<dyn AsRef<[u8]> + Send + Sync>>> = Mutex::new(Vec:
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let input = arguments.input.as_path();
     // Refuses unsuitable files before the browser starts.
-    finite(input)?;
+    read(input)?;
     let shows = format!("shows {}", input.display());
     page::show("view", &arguments.page, &shows, &|request, _| respond(request, input))
 }
@@ -57,7 +57,7 @@ fn respond(request: &Request, input: &Path) -> Result<Answer, Answer> {
     let file = Download::named(request.path.trim_start_matches('/'));
     let file = file.ok_or_else(|| text(StatusCode::NOT_FOUND, "no such page"))?;
     if request.method == "HEAD" {
-        finite(input)?;
+        drawable(input)?;
     }
     let name = input.file_stem().unwrap_or_default().to_string_lossy();
     downloads::answer(request, &name, file, |step| shared(input, file, step))
@@ -84,7 +84,7 @@ fn shared(
         return Err(busy());
     }
     drop(former);
-    let content: Content = Arc::new(download.make(&finite(input)?.0, step)?);
+    let content: Content = Arc::new(download.make(&drawable(input)?.0, step)?);
     made.insert(extension, (stamp, content.clone()));
     Ok(content)
 }

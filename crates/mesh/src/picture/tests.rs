@@ -146,3 +146,16 @@ fn colours_are_converted_to_srgb() {
     assert_eq!(other.get_pixel(0, 0).0, [9, 99, 200]);
     assert_eq!(profile::to_srgb(self::picture().into(), Some(b"no profile")).into_rgb8(), self::picture());
 }
+
+#[test]
+fn a_bmp_whose_alpha_is_0_everywhere_is_opaque() {
+    let rgba = |alpha: u8| {
+        let (mut rgba, mut bytes) = (DynamicImage::from(picture()).into_rgba8(), Cursor::new(Vec::new()));
+        rgba.pixels_mut().for_each(|pixel| pixel.0[3] = alpha);
+        rgba.write_to(&mut bytes, ImageFormat::Bmp).expect("encodes");
+        decode_bytes(Path::new("picture"), bytes.get_ref(), MAX_BYTES).expect("decodes")
+    };
+    let (empty, half) = (rgba(0), rgba(128));
+    assert!(!empty.color().has_alpha() && empty.into_rgb8() == picture());
+    assert!(half.into_rgba8().pixels().all(|pixel| pixel.0[3] == 128));
+}

@@ -313,10 +313,18 @@ impl<'a> Plan<'a> {
             say::info(&format!("resume:  snapsnap train-stage{stage} --resume -o {run}"));
         }
         let weights = quoted(&folder.join(weights));
-        let next = match stage {
-            1 => {
-                let config = self.arguments.config.as_deref().and_then(stage2_config);
-                let config = config.map_or("STAGE2.toml".into(), |path| quoted(&path));
+        let config = self.arguments.config.as_deref().and_then(stage2_config);
+        let next = match (stage, config) {
+            (1, _) if self.config.stage1.only_details => {
+                format!(
+                    "import-weights --fill {weights} puts `details.*` beside other layers (docs/training.md)"
+                )
+            }
+            (1, None) => {
+                format!("a training of stage 2, which begins with --weights {weights} (docs/training.md)")
+            }
+            (1, Some(config)) => {
+                let config = quoted(&config);
                 let data: Vec<String> = self.folders.iter().map(|folder| quoted(folder.root())).collect();
                 let data = data.join(" ");
                 let out = quoted(&folder.with_file_name(format!("{}-stage2", name(folder))));
