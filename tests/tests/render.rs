@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use burn::tensor::{Device, Tensor};
-use glam::{DVec3, Vec3};
+use glam::{DVec2, DVec3, Vec3};
 use snapsnap_splat::{Camera, Gaussians, Orbit, RenderOptions, render, scene, sh};
 use snapsnap_tests::ply::{Format, cloud, ply_bytes};
 use snapsnap_tests::workplace::Workplace;
@@ -255,5 +255,44 @@ fn a_head_is_closed_from_above() {
             let below = depth[i] / alpha[i] - 1.0;
             assert!(below < 0.08, "{x} {y}: {below} m below the top");
         }
+    }
+}
+
+/// From four times as near, the sample person is opaque.
+#[test]
+fn nothing_shines_through_a_person_from_near() {
+    const SIDE: usize = 512;
+    const NEARER: f64 = 4.0;
+    /// Pixels at the outline that are not judged.
+    const RIM: usize = 6;
+    let place = Workplace::empty();
+    succeed(&mut sample::reconstruct(place.folder(), &sample::paths()));
+    let gaussians = scene::read(&place.path("human.ply"), &Device::flex()).expect("Gaussians").gaussians;
+    for yaw in [0.0, 90.0, 180.0, 270.0] {
+        let camera = Camera::orbit_at_yaw_degrees(yaw, SIDE as u32);
+        let alpha = |camera: Camera| {
+            values(render(&gaussians, &[camera], &RenderOptions::inria()).expect("a picture").alpha)
+        };
+        let far = alpha(camera);
+        let is_inside = |x: usize, y: usize| {
+            let around = |at: usize| at.saturating_sub(RIM)..(at + RIM + 1).min(SIDE);
+            around(y).all(|row| around(x).all(|column| far[row * SIDE + column] > 0.9))
+        };
+        // The breast is a little above the middle of the picture.
+        let aim = camera.principal_point - DVec2::new(0.0, 0.12 * SIDE as f64);
+        let middle = DVec2::splat(0.5 * SIDE as f64);
+        let principal_point = middle + NEARER * (camera.principal_point - aim);
+        let near = alpha(Camera { focal: NEARER * camera.focal, principal_point, ..camera });
+        let (mut judged, mut clear) = (0, 0);
+        for (i, alpha) in near.iter().enumerate() {
+            let at = DVec2::new((i % SIDE) as f64 + 0.5, (i / SIDE) as f64 + 0.5);
+            let there = aim + (at - middle) / NEARER;
+            if is_inside(there.x as usize, there.y as usize) {
+                judged += 1;
+                clear += usize::from(*alpha < 0.98);
+            }
+        }
+        assert!(judged > SIDE * SIDE / 4, "{yaw}°: {judged} pixels");
+        assert!(clear as f64 <= 0.005 * judged as f64, "{yaw}°: {clear} of {judged} pixels are not opaque");
     }
 }

@@ -190,8 +190,14 @@ fn five_photographs_have_no_unseen_sides() {
 fn networks_of_neighbours_are_refused_for_other_photographs() {
     let temporary = tempfile::tempdir().expect("a folder");
     let path = |name: &str| temporary.path().join(name).display().to_string();
-    let opposite =
-        ["side_heads=false", "sides=\"predicted\"", "second_layer=false", "mirror=false", "both_ways=false"];
+    let opposite = [
+        "side_heads=false",
+        "sides=\"predicted\"",
+        "second_layer=false",
+        "mirror=false",
+        "both_ways=false",
+        "details.resolution=4096",
+    ];
     let sets: Vec<String> = opposite
         .iter()
         .chain(&["pair_degrees=90"])

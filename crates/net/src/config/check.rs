@@ -135,7 +135,7 @@ impl Config {
             ),
             (
                 "network.pair_degrees",
-                n.details.is_some() && is_oblique,
+                details.is_some() && is_oblique,
                 "must be 180 with `network.details`".into(),
             ),
             (
