@@ -157,7 +157,7 @@ fn unsuitable_files_and_arguments_are_refused_by_name() {
         ("good.ply --cameras good.ply", "good.ply"),
         ("good.ply --cameras wide.json --size 8x8", "another shape"),
         ("good.ply --cameras wide.json --raw r", "one size"),
-        ("good.ply --orbit 1 --size 8", "WIDTHxHEIGHT"),
+        ("good.ply --orbit 1 --size 8x", "WIDTHxHEIGHT"),
         ("good.ply --orbit 1 --size 0x8", "WIDTHxHEIGHT"),
         ("good.ply --orbit 1 --size 8x99999", "32768"),
         ("good.ply --orbit 1 --size 32768x32768", "megapixels"),

@@ -11,7 +11,7 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     let (temporary, config) = place();
     let (one, two) = (temporary.path().join("one"), temporary.path().join("two"));
     let said = succeed(&mut train(1, &config, &one));
-    assert!(said.contains("finished after 40 steps") && said.contains("train-stage2"), "{said}");
+    assert!(said.contains("finished after 40 steps") && said.contains("a training of stage 2"), "{said}");
     let losses = logged(&one, "loss");
     assert_eq!(losses.len(), 40);
     let mean = |part: &[(u64, f64)]| part.iter().map(|(_, loss)| loss).sum::<f64>() / part.len() as f64;
@@ -81,7 +81,12 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
 fn details_are_trained_alone() {
     let (temporary, config) = place();
     let [start, run] = ["start.safetensors", "run"].map(|name| temporary.path().join(name));
-    let details = ["network.anchor=ray", "network.details.resolution=64", "network.details.dims=[4,4,8,8]"];
+    let details = [
+        "network.anchor=ray",
+        "network.net_resolution=32",
+        "network.details.resolution=64",
+        "network.details.dims=[4,4,8,8]",
+    ];
     let set = || details.iter().flat_map(|key| ["--set", key]);
     let networks = temporary.path().join("networks.toml");
     fs::write(&networks, TRAINING.split("[samples]").next().expect("sections of networks")).expect("writes");
