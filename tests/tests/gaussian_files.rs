@@ -389,7 +389,7 @@ fn every_command_draws_the_same_gaussians() {
         succeed(&mut place.run(&format!("render {name} --orbit 1 --size 48 --quiet --raw raw")));
         Numbers::read(&place.path("raw")).f32("color").1
     };
-    let sign = |i: usize| if i % 2 == 0 { 1.0 } else { -1.0 };
+    let sign = |i: usize| if i.is_multiple_of(2) { 1.0 } else { -1.0 };
     write("usual.ply", &|i, property, value| match property {
         "opacity" => 13.8 * sign(i),
         "scale_2" => -23.0,
