@@ -3,15 +3,18 @@
 # interrupted training continues when it is started again. docs/weights.md says where the default weights' own training differed.
 set -eu
 makehuman=$1 avatars=$2
-# people FOLDER SPLIT SEED COUNT OPTION…: people of each of the three makers.
-people() {
-  folder=people/$1
-  made() { cargo xtask prepare "$@" --set 'light.kind="random"' --set views.second_depth=true; }
+# bodies FOLDER SPLIT SEED COUNT OPTION…: people of two makers.
+bodies() {
   options="--split $2 --seed $3 --subjects $4 ${*:5}"
-  made synth $options -o "$folder/synth"
-  made makehuman "$makehuman" $options -o "$folder/makehuman"
+  cargo xtask prepare makehuman "$makehuman" $options -o "people/$1/makehuman"
   # Avatars that cannot be read are skipped, with exit code 2.
-  made avatars "$avatars" $options -o "$folder/avatars" || [ $? = 2 ]
+  cargo xtask prepare avatars "$avatars" $options -o "people/$1/avatars" || [ $? = 2 ]
+}
+# people FOLDER SPLIT SEED COUNT OPTION…: people of all three makers.
+people() {
+  further='--set light.kind="random" --set views.second_depth=true'
+  cargo xtask prepare synth --split $2 --seed $3 --subjects $4 ${*:5} $further -o "people/$1/synth"
+  bodies "$@" $further
 }
 for cameras in default phone; do
   people $cameras train 901 500 --config configs/data/$cameras.toml
@@ -20,8 +23,8 @@ done
 # A few people in views of the size of photographs.
 people large train 903 30 --config configs/data/default.toml --set views.resolution=1024
 people large val 903 4 --config configs/data/default.toml --set views.resolution=1024
-people close train 904 900 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
-people close val 904 16 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
+bodies close train 904 900 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
+bodies close val 904 16 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
 data="people/default/synth people/default/makehuman people/default/avatars people/phone/synth people/phone/makehuman people/phone/avatars"
 cargo xtask train-stage1 --config configs/default/photographs.toml --data $data --resume -o runs/default-photographs
 # The network of the sides begins with random weights.

@@ -278,7 +278,7 @@ fn nothing_shines_through_a_person_from_near() {
             let around = |at: usize| at.saturating_sub(RIM)..(at + RIM + 1).min(SIDE);
             around(y).all(|row| around(x).all(|column| far[row * SIDE + column] > 0.9))
         };
-        // The breast is a little above the middle of the picture.
+        // The chest is a little above the middle of the picture.
         let aim = camera.principal_point - DVec2::new(0.0, 0.12 * SIDE as f64);
         let middle = DVec2::splat(0.5 * SIDE as f64);
         let principal_point = middle + NEARER * (camera.principal_point - aim);

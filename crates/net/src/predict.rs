@@ -136,3 +136,22 @@ fn each_view<T: Send>(
 fn mask_of(view: View, masks: &Tensor<4>) -> Option<Tensor<4>> {
     ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_of_details_hold_the_person_symmetrically_in_whole_cells() {
+        let window = Window { rows: 0..1024, columns: 256..768 };
+        let columns = |person: Option<Range<usize>>, image: usize| {
+            let person = person.map(|columns| Window { rows: 100..900, columns });
+            details_columns(person.as_ref(), &window, 1024, image)
+        };
+        // A cell has 16 pixels. The narrower side has 300 − 256 − 32 = 12 pixels, 400 − 256 − 32 = 112, or half of 144, less 32.
+        assert_eq!(columns(Some(400..724), 1024), 0..512);
+        assert_eq!(columns(Some(400..624), 1024), 112..400);
+        assert_eq!(columns(Some(400..624), 512), 32..224);
+        assert_eq!(columns(None, 1024), 0..512);
+    }
+}

@@ -122,8 +122,8 @@ impl Stored {
         }
     }
 
-    /// Values that other programs' files have: logits of the opacities 0 and 1, logarithms of the scale 0, and
-    /// quaternions so short or long that a render takes them for damage. They become what [`Self::of`] makes of them.
+    /// Makes drawable what other programs' files have: logits of the opacities 0 and 1 and logarithms of the scale 0
+    /// become those that [`Self::of`] stores, and quaternions that a render takes for damage get the length 1.
     pub(crate) fn limit(&mut self) {
         for (column, value) in self.columns[7..11].iter_mut().enumerate() {
             let is_opacity = column == 3;

@@ -45,6 +45,17 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     // There is no config of stage 2 beside the config of stage 1.
     let expected = format!("a training of stage 2, which begins with --weights {}", weights.display());
     assert!(command.contains(&expected), "{command}");
+    let [first, second] = ["stage1.toml", "stage2.toml"].map(|name| temporary.path().join(name));
+    for path in [&first, &second] {
+        fs::copy(&config, path).expect("copies");
+    }
+    let command = next(&succeed(train(1, &first, &one).arg("--resume")));
+    for part in [&*second, &*weights, people()] {
+        assert!(
+            command.starts_with("snapsnap train-stage2") && command.contains(&part.display().to_string()),
+            "{command}"
+        );
+    }
     let said = succeed(train(2, &config, &two).arg("--weights").arg(&weights));
     let command = next(&said);
     assert!(!command.contains("FRONT"), "{command}");

@@ -203,11 +203,14 @@ fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
     let mut jobs = Vec::new();
     for record in table.records() {
         let record = record.map_err(cannot)?;
-        // The reader's own numbers count CRLF twice, and a record may begin with the end of the line before.
-        let start = record.position().map_or(0, |position| position.byte() as usize);
-        let before = text.bytes().enumerate().take_while(|(i, byte)| *i < start || b"\r\n".contains(byte));
-        let line = 1 + before.filter(|(_, byte)| *byte == b'\n').count();
-        let wrong = |message: &str| Failure::file(path, format_args!("line {line}: {message}"));
+        let wrong = |message: &str| {
+            // The reader's own numbers count CRLF twice, and a record may begin with the end of the line before.
+            let start = record.position().map_or(0, |position| position.byte() as usize);
+            let before =
+                text.bytes().enumerate().take_while(|(i, byte)| *i < start || b"\r\n".contains(byte));
+            let line = 1 + before.filter(|(_, byte)| *byte == b'\n').count();
+            Failure::file(path, format_args!("line {line}: {message}"))
+        };
         if record.iter().any(|value| value.contains(char::is_control)) {
             return Err(wrong("a value has a line break: is a quotation mark missing?"));
         }

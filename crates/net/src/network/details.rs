@@ -335,6 +335,29 @@ mod tests {
         assert!(apart(2) > 0.01 && apart(3) > 0.01, "{} {}", apart(2), apart(3));
     }
 
+    /// A person with a bump of one coarse pixel, half a metre from the plane. The background may be anything.
+    #[test]
+    fn what_is_common_to_the_points_nearby_is_no_detail() {
+        const FACTOR: usize = 4;
+        let (device, side) = (Device::flex(), 40 * FACTOR);
+        let is_inside = |i: usize| (16..144).contains(&(i % side)) && (16..144).contains(&(i / side));
+        let is_bump = |i: usize| (80..84).contains(&(i % side)) && (80..84).contains(&(i / side));
+        let of = |value: &dyn Fn(usize) -> f32| {
+            let values: Vec<f32> = (0..side * side).map(value).collect();
+            Tensor::<4>::from_data(TensorData::new(values, [1, 1, side, side]), &device)
+        };
+        let depths = of(&|i| match (is_inside(i), is_bump(i)) {
+            (false, _) => f32::NAN,
+            (true, is_bump) => 0.5 + if is_bump { 0.01 } else { 0.0 },
+        });
+        let found = host(without_mean(depths, &of(&|i| f32::from(u8::from(is_inside(i)))), FACTOR));
+        // Four means of 7×7 have a standard deviation of 4 coarse pixels: the bump's mean is 1/(2π·16) of its height.
+        let top = found[82 * side + 82];
+        assert!((top - 0.01 * (1.0 - 1.0 / (32.0 * std::f32::consts::PI))).abs() < 1e-4, "{top}");
+        assert!(found[40 * side + 20].abs() < 1e-6 && found[0] == 0.0);
+        assert!(found.iter().all(|value| value.is_finite()));
+    }
+
     #[test]
     fn channels_are_the_pixels_of_patches() {
         let device = Device::flex();
