@@ -20,9 +20,7 @@ for cameras in default phone; do
   people $cameras train 901 500 --config configs/data/$cameras.toml
   people $cameras val 901 24 --config configs/data/$cameras.toml
 done
-# A few people in views of the size of photographs.
-people large train 903 30 --config configs/data/default.toml --set views.resolution=1024
-people large val 903 4 --config configs/data/default.toml --set views.resolution=1024
+# People in views of the size of photographs.
 bodies close train 904 900 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
 bodies close val 904 16 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
 data="people/default/synth people/default/makehuman people/default/avatars people/phone/synth people/phone/makehuman people/phone/avatars"
@@ -50,6 +48,6 @@ cargo xtask train-stage1 --config configs/default/details.toml --data people/clo
   --weights runs/details-start.safetensors --resume -o runs/default-details
 [ -e runs/detailed.safetensors ] || cargo xtask import-weights runs/default-both/best.safetensors --fill runs/default-details/best.safetensors \
   $details -o runs/detailed.safetensors
-cargo xtask train-stage2 --config configs/default/regressor.toml --data people/large/synth people/large/makehuman people/large/avatars \
+cargo xtask train-stage2 --config configs/default/regressor.toml --data people/close/makehuman people/close/avatars \
   --weights runs/detailed.safetensors --resume -o runs/default
 cargo xtask import-weights runs/default/best.safetensors --half -o default.safetensors

@@ -60,8 +60,11 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
     // The next run makes only the failed people.
     pair(&photographs, "broken.png", "missing.png");
     fs::write(out.join("anna.ply"), b"kept").expect("written");
+    // A power failure may leave an empty file.
+    fs::write(out.join("other.ply"), b"").expect("written");
     let said = succeed(&mut reconstruct(&table, &out));
-    assert!(said.contains("2 made"), "{said}");
+    assert!(said.contains("3 made"), "{said}");
+    assert!(fs::read(out.join("other.ply")).expect("reads") == other);
     assert_eq!(fs::read(out.join("anna.ply")).expect("reads"), b"kept");
     assert_eq!(
         names(&out),

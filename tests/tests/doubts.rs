@@ -48,6 +48,20 @@ fn an_inverted_mask_is_noticed() {
 }
 
 #[test]
+fn a_hole_in_the_torso_is_noticed() {
+    let temporary = tempfile::tempdir().expect("temporary folder");
+    let photographs = pair(temporary.path(), |mut picture| {
+        for (x, y, pixel) in picture.enumerate_pixels_mut() {
+            let is_hole = x.abs_diff(512).pow(2) + y.abs_diff(320).pow(2) < 30 * 30;
+            pixel.0[3] = if is_hole { 0 } else { pixel.0[3] };
+        }
+        picture
+    });
+    let said = strict(temporary.path(), &photographs, &[]);
+    assert!(said.matches("the mask has a hole in the person's torso").count() == 2, "{said}");
+}
+
+#[test]
 fn somebody_who_lies_is_noticed() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let photographs = pair(temporary.path(), |picture| DynamicImage::from(picture).rotate90().to_rgba8());

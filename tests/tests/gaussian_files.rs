@@ -259,6 +259,8 @@ fn parts(glb: &[u8]) -> (Value, &[u8]) {
     (serde_json::from_slice(&glb[20..20 + length]).expect("JSON"), &glb[28 + length..])
 }
 
+const SPLATS: &str = "/meshes/0/primitives/0/extensions/KHR_gaussian_splatting";
+
 #[test]
 fn glbs_without_gaussians_or_with_others_are_refused() {
     let temporary = tempfile::tempdir().expect("temporary folder");
@@ -288,6 +290,15 @@ fn glbs_without_gaussians_or_with_others_are_refused() {
         ("/accessors/0/count", json!(u64::MAX), "outside of the file"),
         ("/bufferViews/0/byteStride", json!(0), "outside of the file"),
         ("/bufferViews/0/byteOffset", json!(u64::MAX), "outside"),
+        ("/bufferViews/0/byteLength", json!(4), "outside"),
+        ("/buffers/0/uri", json!("other.bin"), "outside of the file"),
+        ("/extensionsRequired", json!(["ACME_more"]), "requires ACME_more"),
+        ("/meshes/0/primitives/0/mode", json!(4), "no plain points"),
+        ("/meshes/0/primitives/0/indices", json!(0), "no plain points"),
+        (&format!("{SPLATS}/kernel"), json!("gaussian2d"), "the `kernel` gaussian2d"),
+        (&format!("{SPLATS}/colorSpace"), json!("lin_rec709_display"), "`colorSpace`"),
+        (&format!("{SPLATS}/projection"), json!("orthographic"), "`projection`"),
+        (&format!("{SPLATS}/sortingMethod"), json!("zDepth"), "`sortingMethod`"),
     ] {
         let mut changed = description.clone();
         let (parent, key) = place.rsplit_once('/').expect("a key");

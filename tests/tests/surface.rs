@@ -306,6 +306,10 @@ fn meshes_that_cannot_be_are_refused() {
     assert!(mesh("human.ply", "no/such/folder/a.glb", &[]).contains("cannot write"));
     assert!(mesh("human.ply", "a.glb", &["--texture", "3"]).contains("64"));
     assert!(mesh("human.ply", "a\nb.obj", &[]).contains("must be plain text"));
+    // Files beside a new OBJ belong to something else.
+    fs::write(path("a.mtl"), "newmtl mine\n").expect("written");
+    assert!(mesh("human.ply", "a.obj", &["--texture", "64"]).contains("belongs to no mesh of this name"));
+    assert_eq!(fs::read_to_string(path("a.mtl")).expect("reads"), "newmtl mine\n");
     let nothing = "ply\nformat ascii 1.0\nelement vertex 0\n".to_owned()
         + &scene::Stored::COLUMNS.map(|name| format!("property float {name}\n")).concat()
         + "end_header\n";

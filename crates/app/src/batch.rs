@@ -103,12 +103,13 @@ impl Batch {
         self.folder.join(name)
     }
 
-    /// The jobs of this shard whose file `output` does not exist yet.
+    /// The jobs of this shard whose file `output` does not exist yet or is empty.
     pub fn missing<T>(&self, jobs: Vec<T>, output: impl Fn(&T) -> PathBuf) -> Vec<T> {
         let all = jobs.into_iter().enumerate();
         let mine = all.filter(|(place, _)| self.shard.is_none_or(|shard| shard.has(*place)));
-        let (there, missing): (Vec<T>, Vec<T>) =
-            mine.map(|(_, job)| job).partition(|job| output(job).exists());
+        let (there, missing): (Vec<T>, Vec<T>) = mine
+            .map(|(_, job)| job)
+            .partition(|job| output(job).metadata().is_ok_and(|there| there.len() > 0));
         if !there.is_empty() {
             say::note(&format!(
                 "{} of {} outputs exist already and are kept",
@@ -137,10 +138,12 @@ impl Batch {
             self.list = Some(list);
         }
         let list = self.list.as_mut().expect("was just opened");
-        // A spreadsheet would take some names for formulas.
-        let is_formula = name.starts_with(['=', '+', '-', '@']);
-        let shown = format!("{}{}", if is_formula { "'" } else { "" }, say::printable(name));
-        list.write_record([shown, failure.to_string()]).map_err(wrong)?;
+        // A spreadsheet would take some texts for formulas.
+        let cell = |text: &str| {
+            let is_formula = text.trim_start().starts_with(['=', '+', '-', '@']);
+            format!("{}{}", if is_formula { "'" } else { "" }, say::printable(text))
+        };
+        list.write_record([cell(name), cell(&failure.to_string())]).map_err(wrong)?;
         list.flush().map_err(|e| Failure::cannot_write(&path, &e))?;
         self.failed += 1;
         say::err(&format!("{name}: {failure}"));

@@ -88,7 +88,7 @@ impl ModelArguments {
 /// Options about the cameras and the person.
 #[derive(Args, Debug, Default)]
 pub struct CameraArguments {
-    /// Height of the person in metres [default: the networks' height, about 1.7].
+    /// Height of the person in metres [default: 1.72].
     #[arg(long, value_name = "METRES")]
     height: Option<f64>,
     /// Focal length of both photographs in millimetres of 35 mm film [default: the files' own, else unknown].

@@ -58,7 +58,7 @@ pub fn lines(text: &str) -> Result<(), Failure> {
 /// Writes the result of a command, as JSON, to stdout. Only strings contain control characters.
 pub fn json(text: &str) -> Result<(), Failure> {
     let escaped = |c: char| match c {
-        c if c.is_control() && c != '\n' => format!("\\u{:04x}", u32::from(c)),
+        c if is_hidden(c) && c != '\n' => format!("\\u{:04x}", u32::from(c)),
         c => c.to_string(),
     };
     result(text.chars().map(escaped).chain(["\n".into()]).collect::<String>().as_bytes())
@@ -80,10 +80,16 @@ pub fn written(outcome: std::io::Result<()>) -> Result<(), Failure> {
     }
 }
 
+/// Whether a character controls the terminal, or the direction of the text around it.
+fn is_hidden(c: char) -> bool {
+    c.is_control()
+        || matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+}
+
 /// The text with escaped control characters, but for line breaks and tabs.
 pub fn printable(text: &str) -> String {
     let shown = |c: char| match c {
-        c if c.is_control() && c != '\n' && c != '\t' => c.escape_default().to_string(),
+        c if is_hidden(c) && c != '\n' && c != '\t' => c.escape_default().to_string(),
         c => c.to_string(),
     };
     text.chars().map(shown).collect()

@@ -53,8 +53,10 @@ pub struct Request {
     length: Option<u64>,
 }
 
+/// Bytes of an answer.
+pub type Bytes = dyn AsRef<[u8]> + Send + Sync;
 /// Content of an answer.
-pub type Content = Arc<dyn AsRef<[u8]> + Send + Sync>;
+pub type Content = Arc<Bytes>;
 
 /// An answer.
 pub struct Answer {
@@ -77,6 +79,14 @@ pub struct Body<'a> {
 const SLOW: Refusal = (StatusCode::REQUEST_TIMEOUT, "the upload is too slow");
 
 impl Body<'_> {
+    /// Whether the client still waits for the answer.
+    pub fn is_awaited(&self) -> bool {
+        let _ = self.stream.set_nonblocking(true);
+        let seen = self.stream.peek(&mut [0]);
+        let _ = self.stream.set_nonblocking(false);
+        seen.map_or_else(|e| e.kind() == io::ErrorKind::WouldBlock, |count| count > 0)
+    }
+
     /// Reads the body. Refuses a body of more than `most` bytes or beyond [`MOST_HELD`], and a slow client. Memory
     /// grows with the bytes that arrive, not with the announced length.
     pub fn read(&mut self, most: u64) -> Result<Upload, Refusal> {

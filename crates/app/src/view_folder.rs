@@ -50,14 +50,19 @@ impl ViewFolder {
         Ok(())
     }
 
-    /// Makes the folder. Removes older cameras, since a folder with cameras must contain all of their pictures.
+    /// Makes the folder. Removes older cameras with their pictures, since a folder with cameras must contain all of their
+    /// pictures and no others.
     pub fn begin(&self) -> Result<(), Failure> {
         make_folder(&self.path)?;
         if self.keeps_cameras {
             return Ok(());
         }
         // A link to the file stays.
-        remove(&file::target_of(&self.path.join(CAMERAS)))
+        let cameras = file::target_of(&self.path.join(CAMERAS));
+        // Pictures of older cameras that no new picture replaces.
+        let older = camera_file::read(&cameras).map_or(0, |older| older.len());
+        (self.views..older).try_for_each(|view| remove(&self.path.join(name(view))))?;
+        remove(&cameras)
     }
 
     /// Writes one view.

@@ -94,11 +94,21 @@ fn numbers(value: &Value, nodes: &mut usize) -> Option<Vec<f64>> {
         }
         Value::Object(parts) => {
             let parts = parts.borrow();
-            // _reconstruct(…) with the state (version, shape, dtype, is_fortran, bytes).
-            let [Value::Bytes(_), _, Value::List(state)] = parts.as_slice() else { return None };
-            let state = state.borrow();
-            let [_, _, Value::Object(dtype), _, bytes] = state.as_slice() else { return None };
-            let bytes = raw(bytes)?;
+            let (bytes, dtype) = match parts.as_slice() {
+                // _reconstruct(…) with the state (version, shape, dtype, is_fortran, bytes).
+                [Value::Bytes(_), _, Value::List(state)] => match state.borrow().as_slice() {
+                    [_, _, Value::Object(dtype), _, bytes] => (raw(bytes)?, dtype.clone()),
+                    _ => return None,
+                },
+                // NumPy 2: _frombuffer(bytes, dtype, shape, order).
+                [Value::Bytes(name), Value::List(arguments)] if name.ends_with(b"._frombuffer") => {
+                    match arguments.borrow().as_slice() {
+                        [bytes, Value::Object(dtype), ..] => (raw(bytes)?, dtype.clone()),
+                        _ => return None,
+                    }
+                }
+                _ => return None,
+            };
             let dtype = dtype.borrow();
             let Some(Value::List(arguments)) = dtype.get(1) else { return None };
             let arguments = arguments.borrow();
@@ -268,10 +278,12 @@ impl<'a> Machine<'a> {
                 let (module, name) = (self.line()?, self.line()?);
                 Value::Bytes([module, name].join(&b'.').into())
             }
-            0x93 => {
-                self.last(2)?;
-                Value::Bytes(b"a name".as_slice().into())
-            }
+            0x93 => match &self.last(2)?[..] {
+                [Value::Bytes(module), Value::Bytes(name)] => {
+                    Value::Bytes([&**module, &**name].join(&b'.').into())
+                }
+                _ => return Err("a name is no text".into()),
+            },
             // A call, or a new object: function and arguments.
             b'R' | 0x81 => Value::Object(shared(self.last(2)?)),
             b'b' => {

@@ -60,7 +60,7 @@ fn mesh<const N: usize>(positions: Vec<Vec3>, faces: [[u32; 4]; N], color: Vec3)
     Mesh {
         positions,
         faces: faces.map(|positions| Face { positions, texcoords: None, material: 0 }).collect(),
-        materials: vec![Material { color, texture: None }],
+        materials: vec![Material { color, ..Material::default() }],
         ..Mesh::default()
     }
 }

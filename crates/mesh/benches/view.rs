@@ -33,7 +33,7 @@ fn ellipsoid(rows: u32, columns: u32) -> Mesh {
         }
     }
     let texture = RgbImage::from_fn(2048, 2048, |x, y| Rgb([x as u8, y as u8, (x * y) as u8]));
-    mesh.materials.push(Material { color: Vec3::ONE, texture: Some(Arc::new(texture)) });
+    mesh.materials.push(Material { texture: Some(Arc::new(texture)), ..Material::default() });
     mesh
 }
 

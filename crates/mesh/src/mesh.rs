@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use glam::{Vec2, Vec3};
-use image::RgbImage;
+use image::{GrayImage, RgbImage};
 
 /// A triangle mesh. [`Mesh::check`] refuses indices out of range and numbers that are not finite.
 #[derive(Debug, Clone, Default)]
@@ -40,11 +40,13 @@ pub struct Material {
     pub color: Vec3,
     /// Texture, if any.
     pub texture: Option<Arc<RgbImage>>,
+    /// 0 where the surface is cut out of its triangles, such as between the strands of a hair card. `None`: nowhere.
+    pub opacity: Option<Arc<GrayImage>>,
 }
 
 impl Default for Material {
     fn default() -> Self {
-        Self { color: Vec3::ONE, texture: None }
+        Self { color: Vec3::ONE, texture: None, opacity: None }
     }
 }
 

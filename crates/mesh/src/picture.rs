@@ -9,6 +9,8 @@ mod tests;
 use std::io::{BufRead, BufReader, Cursor, Read, Seek};
 use std::path::Path;
 
+use exif::{In, Tag};
+use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
 
 use snapsnap_base::{FileError, file, guarded};
@@ -125,18 +127,19 @@ fn decode_from(
     }
     let reader = ImageReader::new(source).with_guessed_format().map_err(FileError::read(path))?;
     let is_bmp = reader.format() == Some(ImageFormat::Bmp);
-    let (picture, orientation, icc) = if reader.format() == Some(ImageFormat::Jpeg) {
-        let bytes = whole(path, reader.into_inner())?;
+    let (picture, turn, icc) = if reader.format() == Some(ImageFormat::Jpeg) {
+        let bytes = jpeg::tidied(whole(path, reader.into_inner())?);
         let jpeg = jpeg::Jpeg::open(&bytes).map_err(&failed)?;
         check(jpeg.size, 0)?;
         jpeg.decode().map_err(&failed)?
     } else {
         let mut decoder = reader.into_decoder().map_err(&failed)?;
         check(decoder.dimensions().into(), decoder.total_bytes())?;
-        let orientation = decoder.orientation().map_err(&failed)?;
-        // A damaged profile is no reason to refuse a picture.
+        // Damaged metadata are no reason to refuse a picture.
+        let exif = decoder.exif_metadata().ok().flatten();
+        let turn = exif.and_then(orientation).or(decoder.orientation().ok());
         let icc = decoder.icc_profile().ok().flatten();
-        (DynamicImage::from_decoder(decoder).map_err(&failed)?, orientation, icc)
+        (DynamicImage::from_decoder(decoder).map_err(&failed)?, turn, icc)
     };
     // The fourth byte of screenshots means nothing.
     let is_invisible = |picture: &DynamicImage| {
@@ -144,6 +147,13 @@ fn decode_from(
     };
     let picture = if is_bmp && is_invisible(&picture) { picture.into_rgb8().into() } else { picture };
     let mut picture = if in_srgb { profile::to_srgb(picture, icc.as_deref()) } else { picture };
-    picture.apply_orientation(orientation);
+    picture.apply_orientation(turn.unwrap_or(Orientation::NoTransforms));
     Ok(picture)
+}
+
+/// The orientation in EXIF data. Some programs write it as another type of number than the standard's.
+fn orientation(exif: Vec<u8>) -> Option<Orientation> {
+    let exif = exif::Reader::new().read_raw(exif).ok()?;
+    let number = exif.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
+    Orientation::from_exif(u8::try_from(number).ok()?)
 }

@@ -15,11 +15,11 @@ use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
 
 use glam::{DVec2, DVec3, Vec3};
-use image::RgbImage;
+use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 use snapsnap_splat::Camera;
 
-use crate::mesh::{Mesh, MeshError};
+use crate::mesh::{Face, Mesh, MeshError};
 pub use light::{Lamp, Light, Lights, Surroundings};
 use occlusion::Occlusion;
 use shade::{Lit, Pyramid, Shader};
@@ -84,6 +84,8 @@ struct Triangle {
     face: u32,
     /// Whether the triangle faces the camera.
     is_front: bool,
+    /// Whether the surface is cut out in places ([`Shader::is_cut`]).
+    has_holes: bool,
 }
 
 /// A mesh with the normals and textures that drawing needs, for any number of views.
@@ -113,9 +115,16 @@ impl<'a> Renderer<'a> {
         Ok(Self { mesh, normals: mesh.normals(), textures, occlusion: OnceLock::new() })
     }
 
+    /// Where the surface of a face is cut out, and the face's texture coordinates.
+    fn holes(&self, face: &Face) -> Option<(&GrayImage, [u32; 3])> {
+        self.mesh.materials[face.material as usize].opacity.as_deref().zip(face.texcoords)
+    }
+
     fn occlusion(&self) -> &Occlusion {
         self.occlusion.get_or_init(|| {
-            let faces: Vec<[u32; 3]> = self.mesh.faces.iter().map(|face| face.positions).collect();
+            // A card with holes would throw the shadow of a board.
+            let faces = self.mesh.faces.iter().filter(|face| self.holes(face).is_none());
+            let faces: Vec<[u32; 3]> = faces.map(|face| face.positions).collect();
             Occlusion::new(&self.mesh.positions, &self.normals, &faces)
         })
     }
@@ -131,7 +140,10 @@ impl<'a> Renderer<'a> {
             self.mesh.positions.par_iter().map(|p| camera.world_to_camera.apply(p.as_dvec3())).collect();
         let faces = self.mesh.faces.par_iter().enumerate();
         let triangles: Vec<Triangle> = faces
-            .filter_map(|(row, face)| triangle(face.positions.map(|row| corners[row as usize]), row, camera))
+            .filter_map(|(row, face)| {
+                let triangle = triangle(face.positions.map(|row| corners[row as usize]), row, camera)?;
+                Some(Triangle { has_holes: self.holes(face).is_some(), ..triangle })
+            })
             .collect();
         let mut lists: Vec<Vec<u32>> = vec![Vec::new(); height.div_ceil(BAND)];
         for (index, t) in (0..).zip(&triangles) {
@@ -166,7 +178,7 @@ impl<'a> Renderer<'a> {
         let bands = lists.par_iter().enumerate().zip(outputs);
         bands.for_each(|((number, list), (color, alpha, depth, second))| {
             let rows = [number * BAND, height.min((number + 1) * BAND)];
-            let Some(band) = Band::new(list, &triangles, rows, &places) else { return };
+            let Some(band) = Band::new(list, &triangles, rows, &places, &shader) else { return };
             for (pixel, seen) in band.nearest.chunks_exact(places.len()).enumerate() {
                 let (x, y) = (band.left + pixel % band.columns, pixel / band.columns);
                 let at = y * width + x;
@@ -178,7 +190,7 @@ impl<'a> Renderer<'a> {
                 (color[at], alpha[at]) = shade(samples, &places, corner, &triangles, &shader);
             }
             if options.second {
-                band.second(list, &triangles, rows, width, second);
+                band.second(list, &triangles, rows, width, &shader, second);
             }
         });
         view
@@ -222,7 +234,15 @@ fn triangle(corners: [DVec3; 3], face: usize, camera: &Camera) -> Option<Triangl
     let (f, c) = (camera.focal, camera.principal_point);
     let (x, y) = (n.x / f.x, n.y / f.y);
     let plane = DVec3::new(x, y, n.z - x * c.x - y * c.y) / distance;
-    Some(Triangle { corners: rounded, plane, columns, rows, face: face as u32, is_front: distance < 0.0 })
+    Some(Triangle {
+        corners: rounded,
+        plane,
+        columns,
+        rows,
+        face: face as u32,
+        is_front: distance < 0.0,
+        has_holes: false,
+    })
 }
 
 /// Positions of the samples within a pixel, in 1/[`SUBPIXELS`]. The last one is the centre, used only for depth.
@@ -243,14 +263,20 @@ struct Band {
 
 impl Band {
     /// Rasterises the triangles of `list` in the rows `rows[0]..rows[1]`; `None` if `list` is empty.
-    fn new(list: &[u32], triangles: &[Triangle], rows: [usize; 2], places: &[[i64; 2]]) -> Option<Self> {
+    fn new(
+        list: &[u32],
+        triangles: &[Triangle],
+        rows: [usize; 2],
+        places: &[[i64; 2]],
+        shader: &Shader,
+    ) -> Option<Self> {
         let columns = || list.iter().map(|index| triangles[*index as usize].columns);
         let left = columns().map(|[first, _]| first).min()?;
         let columns = columns().map(|[_, last]| last).max()? + 1 - left;
         let mut nearest = vec![(0.0, NONE); (rows[1] - rows[0]) * columns * places.len()];
         for &index in list {
             // Depth test of the samples inside the triangle.
-            triangles[index as usize].samples(rows, places, |x, y, place, inverse_depth| {
+            triangles[index as usize].samples(rows, places, shader, |x, y, place, inverse_depth| {
                 let pixel = (y - rows[0]) * columns + x - left;
                 let nearest = &mut nearest[pixel * places.len() + place];
                 if inverse_depth > nearest.0 {
@@ -262,14 +288,22 @@ impl Band {
     }
 
     /// Writes [`View::second`] of the band's rows to `to`, whose rows have `width` pixels.
-    fn second(&self, list: &[u32], triangles: &[Triangle], rows: [usize; 2], width: usize, to: &mut [f32]) {
+    fn second(
+        &self,
+        list: &[u32],
+        triangles: &[Triangle],
+        rows: [usize; 2],
+        width: usize,
+        shader: &Shader,
+        to: &mut [f32],
+    ) {
         let per_pixel = self.nearest.len() / ((rows[1] - rows[0]) * self.columns);
         let centres = self.nearest.iter().skip(per_pixel - 1).step_by(per_pixel);
         // A step of depth peeling: 1/z of the nearest front or back faces behind `limits` (inverse depths).
         let behind = |limits: &[f64], is_front: bool| {
             let mut found = vec![0.0_f64; limits.len()];
             for t in list.iter().map(|index| &triangles[*index as usize]).filter(|t| t.is_front == is_front) {
-                t.samples(rows, &[[SUBPIXELS / 2; 2]], |x, y, _, inverse_depth| {
+                t.samples(rows, &[[SUBPIXELS / 2; 2]], shader, |x, y, _, inverse_depth| {
                     let pixel = (y - rows[0]) * self.columns + x - self.left;
                     // A limit of 0 means no surface.
                     let is_behind =
@@ -293,9 +327,15 @@ impl Band {
 }
 
 impl Triangle {
-    /// Calls `each` with column, row, sample and 1/z of the samples inside the triangle in the rows
+    /// Calls `each` with column, row, sample and 1/z of the samples on the triangle's surface in the rows
     /// `rows[0]..rows[1]`.
-    fn samples(&self, rows: [usize; 2], places: &[[i64; 2]], mut each: impl FnMut(usize, usize, usize, f64)) {
+    fn samples(
+        &self,
+        rows: [usize; 2],
+        places: &[[i64; 2]],
+        shader: &Shader,
+        mut each: impl FnMut(usize, usize, usize, f64),
+    ) {
         // Coefficients of edge function i: inside is ≥ 0. Minus one where points on the edge belong to the neighbour.
         let edges: [[i64; 3]; 3] = std::array::from_fn(|i| {
             let (from, to) = (self.corners[i], self.corners[(i + 1) % 3]);
@@ -310,8 +350,10 @@ impl Triangle {
                 for (place, [dx, dy]) in places.iter().enumerate() {
                     let (sx, sy) = (px + dx, py + dy);
                     if edges.iter().all(|[a, b, c]| a * sx + b * sy + c >= 0) {
-                        let (u, v) = (sx as f64 / SUBPIXELS as f64, sy as f64 / SUBPIXELS as f64);
-                        each(x, y, place, self.plane.dot(DVec3::new(u, v, 1.0)));
+                        let at = DVec2::new(sx as f64, sy as f64) / SUBPIXELS as f64;
+                        if !(self.has_holes && shader.is_cut(self.face as usize, at, self.plane)) {
+                            each(x, y, place, self.plane.dot(at.extend(1.0)));
+                        }
                     }
                 }
             }

@@ -33,75 +33,74 @@ struct Cell {
 }
 
 impl Reconstruction {
-    /// Adds the backing of all views behind the surface's own Gaussians. Each belongs to a pixel of its cell. Cells
-    /// beside a silhouette or a missing Gaussian have none.
+    /// Adds the [`backing`].
     pub fn add_backing(&mut self, config: &Config) {
-        let side = config.network.resolution;
-        let own = [&self.gaussians.means, &self.gaussians.colors].map(|x| host(x.clone()));
-        let (mut rows, mut origins) = ([const { Vec::new() }; 4], Vec::new());
-        for view in View::WITH_SECOND {
-            let cells = self.cells(view, side, [&own[0], &own[1]]);
-            let camera = nominal_camera(view, config.network.pair_degrees, side);
-            let away = camera.world_to_camera.rotation.row(2).as_vec3();
-            let (width, spacing) = (side / CELL, CELL as f32 * pixel_width(side));
-            let inner = (1..width - 1).flat_map(|row| (1..width - 1).map(move |column| row * width + column));
-            for at in inner {
-                let mut around = [at - width, at, at + width].into_iter().flat_map(|row| row - 1..=row + 1);
-                if !around.all(|cell| cells[cell].count == CELL * CELL) {
-                    continue;
-                }
-                let beside = [at - width, at - 1, at + 1, at + width].map(|cell| cells[cell].mean);
-                let distances = beside.map(|mean| mean.distance(cells[at].mean));
-                let [up, left, right, down] = beside;
-                let normal = (right - left).cross(down - up).normalize_or_zero();
-                if normal == Vec3::ZERO || distances.iter().any(|distance| *distance > STEEPEST * spacing) {
-                    continue;
-                }
-                let inwards = normal * normal.dot(away).signum();
-                let turn = Quat::from_rotation_arc(Vec3::Z, inwards);
-                let scale = SCALE * distances.iter().sum::<f32>() / 4.0;
-                rows[0].extend((cells[at].mean + DEPTH * spacing * inwards).to_array());
-                rows[1].extend([turn.w, turn.x, turn.y, turn.z]);
-                rows[2].extend([scale, scale, THICKNESS * spacing]);
-                rows[3].extend(cells[at].color.to_array());
-                origins.extend(cells[at].origin);
-            }
+        let added = backing(&self.gaussians, &self.origins, config);
+        self.steps.push(Step::Backing { gaussians: added.as_ref().map_or(0, |(_, origins)| origins.len()) });
+        if let Some((backing, origins)) = added {
+            self.gaussians = Gaussians::joined(&[self.gaussians.clone(), backing]);
+            self.origins.extend(origins);
         }
-        let n = origins.len();
-        self.steps.push(Step::Backing { gaussians: n });
-        if n == 0 {
-            return;
-        }
-        let Gaussians { means, rotations, scales, opacities, colors } = self.gaussians.clone();
-        let [means, rotations, scales, colors] = {
-            let mut rows = rows.into_iter();
-            [means, rotations, scales, colors].map(|own| {
-                let (values, columns) = (rows.next().unwrap_or_default(), own.dims()[1]);
-                let added = Tensor::from_data(TensorData::new(values, [n, columns]), &own.device());
-                Tensor::cat(vec![own, added], 0)
-            })
-        };
-        let added = Tensor::full([n], OPACITY, &opacities.device());
-        let opacities = Tensor::cat(vec![opacities, added], 0);
-        self.gaussians = Gaussians { means, rotations, scales, opacities, colors };
-        self.origins.extend(origins);
     }
+}
 
-    /// The cells of a view, row by row.
-    fn cells(&self, view: View, side: usize, [means, colors]: [&[f32]; 2]) -> Vec<Cell> {
-        let width = side / CELL;
-        let mut cells = vec![Cell::default(); width * width];
-        for (i, origin) in self.origins.iter().enumerate().filter(|(_, origin)| origin.view == Some(view)) {
-            let [row, column] = [origin.pixel as usize / side / CELL, origin.pixel as usize % side / CELL];
-            let Some(cell) = cells.get_mut(row * width + column).filter(|_| column < width) else { continue };
-            let of_row = |values: &[f32]| Vec3::from_slice(&values[3 * i..]) / (CELL * CELL) as f32;
-            cell.mean += of_row(means);
-            cell.color += of_row(colors);
-            cell.count += 1;
-            cell.origin = Some(*origin);
+/// The backing of all views behind the surface of the Gaussians, and its origins; `None` without one. Each Gaussian
+/// belongs to a pixel of its cell. Cells beside a silhouette or a missing Gaussian have none. Nothing has gradients.
+pub fn backing(surface: &Gaussians, of: &[Origin], config: &Config) -> Option<(Gaussians, Vec<Origin>)> {
+    let side = config.network.resolution;
+    let own = [&surface.means, &surface.colors].map(|x| host(x.clone()));
+    let (mut rows, mut origins) = ([const { Vec::new() }; 4], Vec::new());
+    for view in View::WITH_SECOND {
+        let cells = cells(of, view, side, [&own[0], &own[1]]);
+        let camera = nominal_camera(view, config.network.pair_degrees, side);
+        let away = camera.world_to_camera.rotation.row(2).as_vec3();
+        let (width, spacing) = (side / CELL, CELL as f32 * pixel_width(side));
+        let inner = (1..width - 1).flat_map(|row| (1..width - 1).map(move |column| row * width + column));
+        for at in inner {
+            let mut around = [at - width, at, at + width].into_iter().flat_map(|row| row - 1..=row + 1);
+            if !around.all(|cell| cells[cell].count == CELL * CELL) {
+                continue;
+            }
+            let beside = [at - width, at - 1, at + 1, at + width].map(|cell| cells[cell].mean);
+            let distances = beside.map(|mean| mean.distance(cells[at].mean));
+            let [up, left, right, down] = beside;
+            let normal = (right - left).cross(down - up).normalize_or_zero();
+            if normal == Vec3::ZERO || distances.iter().any(|distance| *distance > STEEPEST * spacing) {
+                continue;
+            }
+            let inwards = normal * normal.dot(away).signum();
+            let turn = Quat::from_rotation_arc(Vec3::Z, inwards);
+            let scale = SCALE * distances.iter().sum::<f32>() / 4.0;
+            rows[0].extend((cells[at].mean + DEPTH * spacing * inwards).to_array());
+            rows[1].extend([turn.w, turn.x, turn.y, turn.z]);
+            rows[2].extend([scale, scale, THICKNESS * spacing]);
+            rows[3].extend(cells[at].color.to_array());
+            origins.extend(cells[at].origin);
         }
-        cells
     }
+    let (n, device) = (origins.len(), surface.device());
+    let [means, rotations, scales, colors] = rows.map(|values: Vec<f32>| {
+        let columns = values.len() / n.max(1);
+        Tensor::<2>::from_data(TensorData::new(values, [n, columns]), &device)
+    });
+    let opacities = Tensor::full([n], OPACITY, &device);
+    (n > 0).then(|| (Gaussians { means, rotations, scales, opacities, colors }, origins))
+}
+
+/// The cells of a view, row by row.
+fn cells(origins: &[Origin], view: View, side: usize, [means, colors]: [&[f32]; 2]) -> Vec<Cell> {
+    let width = side / CELL;
+    let mut cells = vec![Cell::default(); width * width];
+    for (i, origin) in origins.iter().enumerate().filter(|(_, origin)| origin.view == Some(view)) {
+        let [row, column] = [origin.pixel as usize / side / CELL, origin.pixel as usize % side / CELL];
+        let Some(cell) = cells.get_mut(row * width + column).filter(|_| column < width) else { continue };
+        let of_row = |values: &[f32]| Vec3::from_slice(&values[3 * i..]) / (CELL * CELL) as f32;
+        cell.mean += of_row(means);
+        cell.color += of_row(colors);
+        cell.count += 1;
+        cell.origin = Some(*origin);
+    }
+    cells
 }
 
 #[cfg(test)]

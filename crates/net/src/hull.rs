@@ -10,12 +10,17 @@ use crate::network::{View, nominal_camera, pixel_width};
 /// Largest number of steps of a point towards the silhouettes, which bounds the time on large canvases.
 const MOST_STEPS: f64 = 100.0;
 
-/// The space inside the masks of the two photographs.
+/// Depth in metres by which a point may lie before the surface that a photograph shows.
+const BEFORE: f32 = 0.005;
+
+/// The space inside the masks of the two photographs, and behind the surfaces that they show.
 pub struct Hull {
     side: usize,
     /// Dilated masks.
     masks: [Vec<bool>; 2],
     cameras: [Camera; 2],
+    /// Depth of the surface in each pixel, 0 without one. Empty if surfaces do not count.
+    surfaces: [Vec<f32>; 2],
 }
 
 impl Hull {
@@ -23,18 +28,40 @@ impl Hull {
     /// The nominal cameras are the cameras that see upright people (docs/method.md, "Upright targets").
     pub fn new(masks: [&[bool]; 2], side: usize, margin: usize) -> Self {
         let cameras = [View::Front, View::Back].map(|view| nominal_camera(view, OPPOSITE, side));
-        Self { side, masks: masks.map(|mask| dilated(mask, side, margin)), cameras }
+        let surfaces = [Vec::new(), Vec::new()];
+        Self { side, masks: masks.map(|mask| dilated(mask, side, margin)), cameras, surfaces }
     }
 
-    /// Whether a point `[x, y, z]`, metres in the front camera's frame, is within the masks of both cameras.
+    /// The same with the surfaces of front and back: points `[2, S, S, 3]`, metres in the front camera's frame, with a
+    /// confidence `[2, S, S]` above `least`.
+    fn behind(mut self, points: &[f32], conf: &[f32], least: f32) -> Self {
+        let area = self.side * self.side;
+        for view in [0, 1] {
+            let depth = |pixel: usize| {
+                let at = view * area + pixel;
+                let is_surface = self.masks[view][pixel] && conf[at] > least;
+                let point = is_surface.then(|| DVec3::from([0, 1, 2].map(|c| f64::from(points[3 * at + c]))));
+                point
+                    .and_then(|point| self.cameras[view].project(point))
+                    .map_or(0.0, |(_, depth)| depth as f32)
+            };
+            self.surfaces[view] = (0..area).into_par_iter().map(depth).collect();
+        }
+        self
+    }
+
+    /// Whether a point `[x, y, z]`, metres in the front camera's frame, is within the masks of both cameras and not
+    /// before their surfaces.
     pub fn contains(&self, point: [f32; 3]) -> bool {
         let point = DVec3::from(point.map(f64::from));
-        self.masks.iter().zip(&self.cameras).all(|(mask, camera)| {
-            let Some((place, _)) = camera.project(point) else { return false };
+        [0, 1].into_iter().all(|view| {
+            let Some((place, depth)) = self.cameras[view].project(point) else { return false };
             let inside = 0.0..self.side as f64;
+            let at = place.y as usize * self.side + place.x as usize;
             inside.contains(&place.x)
                 && inside.contains(&place.y)
-                && mask[place.y as usize * self.side + place.x as usize]
+                && self.masks[view][at]
+                && self.surfaces[view].get(at).is_none_or(|surface| depth as f32 >= surface - BEFORE)
         })
     }
 
@@ -53,8 +80,8 @@ impl Hull {
     }
 }
 
-/// Moves the sides' points that lie outside of the photographs' silhouettes along their lines of sight until they are
-/// inside (docs/method.md, "Points inside the silhouettes"). `masks` `[S, S]` belong to the photographs. `points`
+/// Moves the sides' points that lie outside of the photographs' silhouettes, or before the surfaces of front and back,
+/// along their lines of sight until they do not (docs/method.md, "Points inside the silhouettes"). `masks` `[S, S]` belong to the photographs. `points`
 /// `[V, S, S, 3]` are metres in the front camera's frame. Points with a confidence `conf` `[V, S, S]` too low for a
 /// Gaussian stay. Returns the number of points that moved.
 pub(crate) fn carve(config: &NetworkConfig, masks: [&[bool]; 2], points: &mut [f32], conf: &[f32]) -> usize {
@@ -63,7 +90,7 @@ pub(crate) fn carve(config: &NetworkConfig, masks: [&[bool]; 2], points: &mut [f
     if reach == 0.0 || conf.len() <= 2 * area {
         return 0;
     }
-    let hull = Hull::new(masks, side, 0);
+    let hull = Hull::new(masks, side, 0).behind(points, conf, config.conf_threshold);
     let views = points.chunks_exact_mut(3 * area).zip(conf.chunks_exact(area)).zip(View::WITH_SECOND);
     views
         .skip(2)
@@ -113,6 +140,8 @@ fn spread(inside: &[bool], [lines, length]: [usize; 2], strides: [usize; 2], mar
 
 #[cfg(test)]
 mod tests {
+    use glam::DVec2;
+
     use super::*;
     use crate::network::nominal_camera;
 
@@ -163,6 +192,32 @@ mod tests {
         config.hull_reach = 0.05;
         let (points, count) = carved(&config);
         assert!(count == 0 && bits(&points) == bits(&given), "the way into the half is longer than 0.05 m");
+    }
+
+    /// The front shows a step: a surface 1.8 m away on the left half, 2.1 m on the right.
+    #[test]
+    fn points_of_sides_move_behind_the_surfaces_of_the_photographs() {
+        let (side, area) = (64, 64 * 64);
+        let config = NetworkConfig { resolution: side, hull_margin: Some(8), ..NetworkConfig::default() };
+        let camera = nominal_camera(View::Front, OPPOSITE, side);
+        let (mut points, mut conf) = (vec![0.0; 6 * 3 * area], vec![0.0; 6 * area]);
+        for pixel in 0..area {
+            let place = DVec2::new((pixel % side) as f64, (pixel / side) as f64) + 0.5;
+            let ray = (place - camera.principal_point) / camera.focal;
+            let depth = if ray.x < 0.0 { 1.8 } else { 2.1 };
+            points[3 * pixel..][..3].copy_from_slice(&(depth * ray.extend(1.0)).as_vec3().to_array());
+        }
+        conf[..area].fill(1.0);
+        // Before the right half, and before it by less than the tolerance.
+        let at = 3 * area * View::Right as usize;
+        points[at..at + 6].copy_from_slice(&[0.03, 0.2, 1.95, 0.03, 0.2, 2.096]);
+        conf[area * View::Right as usize..][..2].fill(1.0);
+        let all = vec![true; area];
+        let before = points.clone();
+        assert_eq!(carve(&config, [&all, &all], &mut points, &conf), 1);
+        assert!(points[at] <= 0.0 && points[at] > -0.05, "{}", points[at]);
+        points[at..at + 3].copy_from_slice(&before[at..at + 3]);
+        assert!(points == before, "nothing else moves");
     }
 
     /// Against the definition, pixel by pixel.

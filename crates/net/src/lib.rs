@@ -23,6 +23,7 @@ mod valid_pixels;
 pub mod weights;
 mod window;
 
+pub use backing::backing;
 pub use hull::dilated;
 pub use network::pixel_width;
 pub use photograph::Photograph;

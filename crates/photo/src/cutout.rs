@@ -88,9 +88,10 @@ impl<'a> Cutout<'a> {
             (Ok(mask), _) => Matte { rgb, mask, look: None },
             (Err(_), Cutting::Missing | Cutting::All) => {
                 matte(rgb, &segment, &pose, strokes).ok_or_else(|| {
-                    let message =
-                        "no person was found in the picture: give masks with --masks FRONT_MASK BACK_MASK";
-                    FileError::unsuitable(path, message)
+                    // A page has no options.
+                    let is_path = matches!(content, Content::File);
+                    let advice = if is_path { ": give masks with --masks FRONT_MASK BACK_MASK" } else { "" };
+                    FileError::unsuitable(path, format!("no person was found in the picture{advice}"))
                 })?
             }
             (Err(message), Cutting::Given) => return Err(FileError::unsuitable(path, message)),
@@ -193,13 +194,19 @@ fn nobody(mask_path: &Path, placement: Placement) -> FileError {
     FileError::unsuitable(mask_path, message)
 }
 
-/// A mask picture's brightness, black where it is transparent.
+/// A mask picture's brightness, black where it is transparent. A picture of black and one dark colour is a picture of
+/// labels, whose colour marks the person.
 fn grey(picture: &DynamicImage) -> GrayImage {
     let pixels = picture.to_luma_alpha8();
-    GrayImage::from_fn(pixels.width(), pixels.height(), |x, y| {
+    let mut mask = GrayImage::from_fn(pixels.width(), pixels.height(), |x, y| {
         let [value, alpha] = pixels.get_pixel(x, y).0;
         image::Luma([(u16::from(value) * u16::from(alpha) / 255) as u8])
-    })
+    });
+    let label = mask.iter().copied().find(|value| *value > 0).filter(|value| *value < INSIDE);
+    if label.is_some_and(|label| mask.iter().all(|value| [0, label].contains(value))) {
+        mask.iter_mut().for_each(|value| *value = if *value > 0 { u8::MAX } else { 0 });
+    }
+    mask
 }
 
 /// The alpha channel as a mask.

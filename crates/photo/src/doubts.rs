@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use glam::Vec2;
 use image::{GrayImage, RgbImage};
 use serde::Serialize;
 
@@ -19,6 +20,8 @@ const WIDEST: f32 = 1.2;
 /// Least overlap (intersection over union) of the front's silhouette and the mirrored back's, scaled to one height.
 /// Right pairs have 0.63 and more (docs/notes/photographs.md).
 const OVERLAP: f32 = 0.6;
+/// Share of the torso outside of the mask from which the mask has a hole.
+const HOLE: f32 = 0.02;
 /// Side of the grid on which silhouettes and colours are compared, in cells.
 const GRID: u32 = 64;
 /// Columns of a silhouette's grid, which is wider than outstretched arms.
@@ -71,6 +74,8 @@ pub enum Sign {
     Lies,
     /// The person sits.
     Sits,
+    /// The mask leaves out a part of the torso.
+    Hole,
     /// Parts of the body are outside of the picture.
     Outside {
         /// The parts.
@@ -132,6 +137,7 @@ impl fmt::Display for Sign {
             }
             Self::Lies => write!(f, "the person does not stand upright"),
             Self::Sits => write!(f, "the person seems to sit: the person should stand"),
+            Self::Hole => write!(f, "the mask has a hole in the person's torso"),
             Self::Outside { parts } => {
                 write!(f, "outside of the picture: {}: the whole person must be visible", list(parts))
             }
@@ -181,11 +187,17 @@ pub(super) fn signs(one: &Cutout) -> Vec<Sign> {
         Sight::Person(joints) => joints,
     };
     let parts = joints.outside(one.frame.size);
+    let is_out = |at: &Vec2| {
+        let (x, y) = (at.x.max(0.0) as u32, at.y.max(0.0) as u32);
+        one.mask.get_pixel_checked(x, y).is_some_and(|mask| mask[0] < INSIDE)
+    };
+    let (count, out) = (joints.on_torso().count(), joints.on_torso().filter(is_out).count());
     let found = [
         (one.is_accompanied, Sign::Accompanied),
         (joints.lies(), Sign::Lies),
         (!joints.lies() && joints.sits(), Sign::Sits),
         (!joints.lies() && joints.facing() == Some(Facing::Side), Sign::FromTheSide),
+        (out as f32 > HOLE * count as f32, Sign::Hole),
         (!parts.is_empty(), Sign::Outside { parts }),
     ];
     signs.extend(found.into_iter().filter(|(is_so, _)| *is_so).map(|(_, sign)| sign));

@@ -8,6 +8,7 @@ use snapsnap_base::{file, guarded};
 use snapsnap_splat::{Camera, Orbit};
 
 use crate::placing::Mapping;
+use crate::plane_map::PlaneMap;
 use crate::source::{Content, Source};
 
 /// Focal lengths of lenses, in millimetres of 35 mm film.
@@ -129,6 +130,19 @@ impl Viewpoint {
         let principal = Orbit::default().camera(side as u32).principal_point;
         let below = frame.mapping.source(principal).y - f64::from(frame.size[1]) / 2.0;
         pitch + (below / pixels(focal, frame.size)).atan().to_degrees()
+    }
+
+    /// Height of a person on the body's axis over its height in the nominal camera, which takes the same picture.
+    /// Infinite if there is none.
+    pub fn stretch(&self) -> f64 {
+        // The lowest and the highest point of the nominal person, in metres.
+        const ENDS: [f64; 2] = [0.04, 1.83];
+        let maps =
+            PlaneMap::new(&Self::default().camera(0.0, 1), &self.camera(0.0, 1), &Mapping::AS_IT_IS, 1.0);
+        match ENDS.map(|y| maps.apply(DVec3::new(0.0, y, 0.0))) {
+            [Some(low), Some(high)] => (high.y - low.y) / (ENDS[1] - ENDS[0]),
+            _ => f64::INFINITY,
+        }
     }
 
     /// The camera of this viewpoint on a canvas of `side` pixels, `yaw_degrees` around the person from the front.

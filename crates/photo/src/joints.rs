@@ -120,6 +120,19 @@ impl Joints {
         [11, 23].map(|left| 0.5 * (self.at(left) + self.at(left + 1)))
     }
 
+    /// Places all over the torso, away from its outline.
+    pub fn on_torso(&self) -> impl Iterator<Item = Vec2> {
+        /// Places along an axis.
+        const COUNT: usize = 24;
+        let [left, right, hip_left, hip_right] = [11, 12, 23, 24].map(|joint| self.at(joint));
+        // From a fifth of the way on.
+        let share = |i: usize| 0.2 + 0.6 * (i as f32 + 0.5) / COUNT as f32;
+        (0..COUNT * COUNT).map(move |i| {
+            let across = share(i % COUNT);
+            left.lerp(right, across).lerp(hip_left.lerp(hip_right, across), share(i / COUNT))
+        })
+    }
+
     /// Length of the torso in pixels.
     fn length(&self) -> f32 {
         let [shoulders, hips] = self.torso();

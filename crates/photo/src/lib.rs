@@ -38,9 +38,7 @@ pub use doubts::{Doubt, Sign};
 pub use exif_camera::{ELEVATIONS, FOCALS, Frame, Shot, Viewpoint};
 use exposure::match_back;
 pub use joints::{Facing, Joint, Part};
-pub use person::{
-    DISTANCES, DistanceBy, ElevationBy, Lens, NoGaussian, Person, Seat, Told, Unplaced, person,
-};
+pub use person::{DISTANCES, DistanceBy, ElevationBy, Lens, NoPerson, Person, Seat, Told, Unplaced, person};
 use placing::together;
 pub use placing::{Mapping, on_canvas};
 pub use plane_map::PlaneMap;

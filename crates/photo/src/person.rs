@@ -3,7 +3,7 @@
 use std::fmt;
 use std::ops::RangeInclusive;
 
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::Tensor;
 use serde::Serialize;
 use snapsnap_net::config::{Config, WorldFrame};
 use snapsnap_net::steps::Step;
@@ -21,8 +21,9 @@ use crate::surface::reconstruct;
 pub const DISTANCES: RangeInclusive<f64> = 1.0..=30.0;
 /// Assumed height of a person whose height is not given, in metres.
 const USUAL: f64 = 1.72;
-/// Share of the Gaussians at either end of the heights that may be outliers.
-const OUTSIDE: f64 = 0.0002;
+/// Largest height of a person over its height in the nominal cameras, with the same pictures. From 60° above and two
+/// metres away it is 3.4.
+const TALLEST: f64 = 4.0;
 
 /// What a user says of the photographs.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -171,12 +172,15 @@ impl Told {
         };
         let pitch = frame.shot.pitch.zip(focal);
         let pitch = pitch.map(|(pitch, focal)| Viewpoint::elevation(pitch, focal, frame, side));
-        let (elevation, elevation_by) =
-            match (self.elevation, pitch.filter(|pitch| ELEVATIONS.contains(pitch))) {
-                (Some(elevation), _) => (elevation, ElevationBy::Told),
-                (None, Some(elevation)) => (elevation, ElevationBy::File),
-                (None, None) => (nominal.elevation, ElevationBy::Unknown),
-            };
+        let is_possible = |elevation: &f64| {
+            ELEVATIONS.contains(elevation)
+                && Viewpoint { elevation: *elevation, distance }.stretch() <= TALLEST
+        };
+        let (elevation, elevation_by) = match (self.elevation, pitch.filter(is_possible)) {
+            (Some(elevation), _) => (elevation, ElevationBy::Told),
+            (None, Some(elevation)) => (elevation, ElevationBy::File),
+            (None, None) => (nominal.elevation, ElevationBy::Unknown),
+        };
         Seat {
             viewpoint: Viewpoint { elevation, distance },
             distance: distance * tall / height,
@@ -199,19 +203,33 @@ pub struct Person {
     pub made: Reconstruction,
 }
 
-/// No Gaussian came out of photographs.
+/// No person came out of photographs.
 #[derive(Debug, thiserror::Error)]
-#[error("no Gaussian came out of these photographs")]
-pub struct NoGaussian {
-    /// The steps of the networks.
-    pub steps: Vec<Step>,
+pub enum NoPerson {
+    /// The networks made no Gaussian.
+    #[error("no Gaussian came out of these photographs")]
+    Empty {
+        /// The steps of the networks.
+        steps: Vec<Step>,
+    },
+    /// The person would be far too tall for its width.
+    #[error(
+        "a camera {distance:.2} m away that looks down by {elevation:.0}° cannot have taken these photographs: check --distance and --elevation"
+    )]
+    Camera {
+        /// Distance of the camera in metres.
+        distance: f64,
+        /// How far it looks down, in degrees.
+        elevation: f64,
+    },
 }
 
-/// Makes the person in a front and a back photograph, restored to the real cameras and to its height. `stage` is
-/// called with the name of each module before it runs.
+/// Makes the person in a front and a back photograph, restored to the real cameras. The person stands on y = 0 and has
+/// the told height, or the usual one, if cameras have an effect ([`Told::unplaced`]). `stage` is called with the name of
+/// each module before it runs.
 ///
 /// # Errors
-/// [`NoGaussian`].
+/// [`NoPerson`].
 ///
 /// # Panics
 /// If there are not two photographs on canvases of the networks' size.
@@ -220,12 +238,12 @@ pub fn person(
     networks: &Reconstructor,
     told: &Told,
     stage: &dyn Fn(&'static str),
-) -> Result<Person, NoGaussian> {
+) -> Result<Person, NoPerson> {
     let [front, back] = &*photographs.canvases else { panic!("a person needs two photographs") };
     let config = networks.config();
     let made = reconstruct(networks, [front, back], stage);
     if made.gaussians.is_empty() {
-        return Err(NoGaussian { steps: made.steps });
+        return Err(NoPerson::Empty { steps: made.steps });
     }
     let mut gaussians = made.in_world(config);
     let mut seats = None;
@@ -233,27 +251,28 @@ pub fn person(
         let side = config.network.resolution;
         let [floor, top] = range(&host(gaussians.means.clone()));
         let here = [0, 1].map(|i| told.seat(&photographs.frames[i], side, top - floor));
-        if told.height.is_some() || here.iter().any(|seat| seat.viewpoint != Viewpoint::default()) {
+        if let Some(Seat { distance, elevation, .. }) =
+            here.iter().find(|seat| seat.viewpoint.stretch() > TALLEST)
+        {
+            return Err(NoPerson::Camera { distance: *distance, elevation: *elevation });
+        }
+        if here.iter().any(|seat| seat.viewpoint != Viewpoint::default()) {
             let restoration = Restoration::to_viewpoints(here.map(|seat| seat.viewpoint));
             let person = restoration.person(made.gaussians.clone(), &made.origins);
             gaussians = placed(config, person, &restoration.front.world_to_camera.inverse());
-            let mut means = host(gaussians.means.clone());
-            let [low, top] = range(&means);
-            // The lowest point returns to its old height.
-            means.iter_mut().skip(1).step_by(3).for_each(|y| *y += (floor - low) as f32);
-            let scale = told.height.map_or(1.0, |wanted| wanted / (top - low));
-            let means =
-                Tensor::from_data(TensorData::new(means, gaussians.means.dims()), &gaussians.device());
-            gaussians = Gaussians { means, ..gaussians }.scaled(scale);
         }
+        let [low, high] = range(&host(gaussians.means.clone()));
+        let sole = Tensor::from_floats([[0.0, low, 0.0]], &gaussians.device());
+        let means = gaussians.means - sole;
+        gaussians = Gaussians { means, ..gaussians }.scaled(here[0].height / (high - low));
         seats = Some(here);
     }
     Ok(Person { gaussians, seats, made })
 }
 
-/// The y of the person's lowest and highest Gaussians, without outliers, in metres.
+/// The y of the person's lowest and highest Gaussian, in metres.
 fn range(means: &[f32]) -> [f64; 2] {
-    let mut heights: Vec<f32> = means.chunks_exact(3).map(|mean| mean[1]).collect();
-    heights.sort_unstable_by(f32::total_cmp);
-    [OUTSIDE, 1.0 - OUTSIDE].map(|share| f64::from(heights[(share * (heights.len() - 1) as f64) as usize]))
+    let heights = means.iter().skip(1).step_by(3);
+    let range = heights.fold([f32::INFINITY, f32::NEG_INFINITY], |[a, b], y| [a.min(*y), b.max(*y)]);
+    range.map(f64::from)
 }

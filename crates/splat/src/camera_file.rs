@@ -1,4 +1,6 @@
-//! `cameras.json`: a list of pinhole cameras.
+//! `cameras.json`: a list of pinhole cameras; and the cameras of other programs.
+
+mod foreign;
 
 use std::io::Write;
 use std::path::Path;
@@ -68,6 +70,20 @@ fn camera(entry: &Value) -> Result<Camera, String> {
 /// error names the entry and the field.
 pub fn read(path: &Path) -> Result<Vec<Camera>, FileError> {
     parse(path, &file::read_text(path, MAX_BYTES).map_err(FileError::read(path))?)
+}
+
+/// Reads the cameras of `path`, or the cameras that 3D Gaussian splatting (`cameras.json`) or programs for radiance
+/// fields (`transforms.json`) have written there. Pictures without a size get `size`. The world is the file's.
+///
+/// # Errors
+/// As [`read`], and for pictures without a size or with a distorted lens.
+pub fn read_any(path: &Path, size: Option<[u32; 2]>) -> Result<Vec<Camera>, FileError> {
+    let text = file::read_text(path, MAX_BYTES).map_err(FileError::read(path))?;
+    match foreign::cameras(&text, size) {
+        Some(Ok(cameras)) => Ok(cameras),
+        Some(Err(problem)) => Err(FileError::unsuitable(path, problem)),
+        None => parse(path, &text),
+    }
 }
 
 /// The cameras in `text`, which is the content of `path`.

@@ -56,6 +56,19 @@ impl Gaussians {
         check("colors", &self.colors.dims(), &[n, 3])
     }
 
+    /// All Gaussians of these sets.
+    pub fn joined(parts: &[Self]) -> Self {
+        let rows =
+            |of: fn(&Self) -> &Tensor<2>| Tensor::cat(parts.iter().map(|part| of(part).clone()).collect(), 0);
+        Self {
+            means: rows(|part| &part.means),
+            rotations: rows(|part| &part.rotations),
+            scales: rows(|part| &part.scales),
+            opacities: Tensor::cat(parts.iter().map(|part| part.opacities.clone()).collect(), 0),
+            colors: rows(|part| &part.colors),
+        }
+    }
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means.dims()[0]

@@ -7,6 +7,7 @@
 use std::io::{self, Read, Write};
 
 use serde_json::{Map, Value, json};
+use snapsnap_base::quoted;
 
 use crate::sh;
 use crate::stored::{COEFFICIENTS, MIN_SCALE, Problem, Stored, logit, opacity, unit};
@@ -187,8 +188,32 @@ impl File<'_> {
                 return Err(format!("it has {count} primitives with {EXTENSION}; files with one are read"));
             }
         };
-        if primitive["extensions"][EXTENSION]["extensions"].is_object() {
+        let told = &primitive["extensions"][EXTENSION];
+        if told["extensions"].is_object() {
             return Err("its Gaussians are compressed by another extension".into());
+        }
+        let shown = |value: &Value| value.as_str().map_or_else(|| value.to_string(), quoted);
+        // The specification gives defaults to the last two.
+        for (name, value, has_default) in [
+            ("kernel", "ellipse", false),
+            ("colorSpace", "srgb_rec709_display", false),
+            ("projection", "perspective", true),
+            ("sortingMethod", "cameraDistance", true),
+        ] {
+            if told[name] != json!(value) && !(has_default && told[name].is_null()) {
+                let found = shown(&told[name]);
+                return Err(format!("its Gaussians have the `{name}` {found}; only {value} is read"));
+            }
+        }
+        if primitive["mode"] != json!(0) || !primitive["indices"].is_null() || primitive["targets"].is_array()
+        {
+            return Err("its Gaussians are no plain points (`mode` 0 without `indices` and `targets`)".into());
+        }
+        if list("buffers").first().is_none_or(|buffer| !buffer["uri"].is_null()) {
+            return Err("its Gaussians are outside of the file, which is not read".into());
+        }
+        if let Some(other) = list("extensionsRequired").iter().find(|name| **name != json!(EXTENSION)) {
+            return Err(format!("it requires {}, which is not read", shown(other)));
         }
         let nodes = list("nodes").iter().filter(|node| node["mesh"] == json!(mesh)).count();
         if nodes != 1 {
@@ -262,8 +287,11 @@ impl File<'_> {
             let end = first
                 .checked_add(count.checked_sub(1)?.checked_mul(stride)?)?
                 .checked_add(4 * size as u64)?;
-            let inside =
-                end <= self.binary.len() as u64 && stride >= 4 * size as u64 && view["buffer"] == json!(0);
+            let limit = number(&view["byteOffset"], 0)?.checked_add(view["byteLength"].as_u64()?)?;
+            let inside = end <= limit.min(self.binary.len() as u64)
+                && stride >= 4 * size as u64
+                && view["buffer"] == json!(0)
+                && view["extensions"].is_null();
             inside.then_some((first as usize, stride as usize, count as usize))
         };
         let (first, stride, count) = place().ok_or_else(|| bad("is empty, or lies outside of the file"))?;

@@ -21,6 +21,8 @@ const ROUNDS: usize = 12;
 const FIRST_LEFT_OUT: u8 = 252;
 /// Largest absolute value of a Gaussian. The range of larger values may overflow f32.
 const LARGEST: f32 = 1e30;
+/// Largest absolute colour and logarithm of a scale. Larger ones look the same, and take the others' precision.
+const MOST: f32 = 100.0;
 /// Largest side of a WebP picture in pixels.
 const MAX_SIDE: usize = 16_383;
 
@@ -40,10 +42,16 @@ pub(crate) fn check(stored: &Stored) -> Result<(), String> {
 
 /// Losses beyond quantisation, a sentence each.
 pub(crate) fn losses(stored: &Stored) -> Vec<String> {
-    match stored.degree() {
+    let mut losses = match stored.degree() {
         0 => Vec::new(),
         degree => vec![format!("SH of degree {degree} became degree 0, as in every SOG of this program")],
+    };
+    let columns = [7..10, 11..14].into_iter().flat_map(|of| &stored.columns[of]);
+    match columns.flatten().filter(|value| value.abs() > MOST).count() {
+        0 => {}
+        count => losses.push(format!("{count} scales and colours beyond ±{MOST} were cut off there")),
     }
+    losses
 }
 
 /// Writes a SOG of Gaussians that [`check`] accepts.
@@ -171,6 +179,7 @@ struct Codebook(Vec<f32>);
 impl Codebook {
     fn of(columns: &[Vec<f32>]) -> Self {
         let mut values = columns.concat();
+        values.iter_mut().for_each(|value| *value = value.clamp(-MOST, MOST));
         values.sort_unstable_by(f32::total_cmp);
         let sums: Vec<f64> = std::iter::once(0.0)
             .chain(values.iter().scan(0.0, |sum, value| {

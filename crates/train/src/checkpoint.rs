@@ -11,6 +11,7 @@ use snapsnap_net::config::Precision;
 use snapsnap_net::weights::{Source, WeightsError, not_finite, write_tensors};
 use snapsnap_ops::host;
 
+use crate::config::MAX_STEPS;
 use crate::identity::Identity;
 use crate::learner::{Learner, Progress};
 use crate::networks::{Rows, row};
@@ -65,6 +66,9 @@ pub(crate) fn load<T: Task>(
         serde_json::from_str(text).map_err(|e| wrong(format!("{RECORD_KEY}: {e}")))?;
     if progress.stage != T::STAGE {
         return Err(wrong(format!("is of stage {}, not of stage {}", progress.stage, T::STAGE)));
+    }
+    if progress.step > MAX_STEPS || progress.skipped > progress.step {
+        return Err(wrong(format!("is damaged: it tells of {} steps", progress.step)));
     }
     let read = |name: &String| Ok((name.clone(), source.read_f32(name)?));
     let mut rows = source.tensors().keys().map(read).collect::<Result<BTreeMap<_, _>, WeightsError>>()?;

@@ -10,6 +10,9 @@ use snapsnap_net::config::{ConfMode, Config, ModeConfig, NetworkConfig, Precisio
 use crate::optimizer::OptimizerConfig;
 use crate::schedule::Schedule;
 
+/// Most steps of a training.
+pub const MAX_STEPS: u64 = 100_000_000;
+
 /// All settings of a training. The default is the published training.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -169,7 +172,7 @@ impl TrainConfig {
     fn problem(&self) -> Option<(String, String)> {
         let (t, two) = (&self.training, &self.stage2);
         let ranges = [
-            ("training.steps", t.steps as f64, 1.0..=1e8),
+            ("training.steps", t.steps as f64, 1.0..=MAX_STEPS as f64),
             ("training.batch", t.batch as f64, 1.0..=4096.0),
             ("training.workers", t.workers as f64, 1.0..=256.0),
             ("training.log_every", t.log_every as f64, 1.0..=1e6),

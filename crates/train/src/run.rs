@@ -28,6 +28,8 @@ const MAX_FAILURES: u64 = 20;
 
 /// State of a run, relative to its folder.
 pub const STATE: &str = "state/state.safetensors";
+/// The state before [`STATE`], for a run whose last one is damaged.
+const FORMER: &str = "state/former.safetensors";
 /// Config of a run.
 pub const CONFIG: &str = "config.toml";
 /// Latest weights of a run.
@@ -188,7 +190,18 @@ impl<'a, T: Task> Session<'a, T> {
         let is_begun = options.ranks.gather(&state.exists())[0];
         let mut is_changed = false;
         if is_begun {
-            let there = checkpoint::load(&state, &mut learner, &options.device.clone().inner())?;
+            let device = options.device.clone().inner();
+            let there = match checkpoint::load(&state, &mut learner, &device) {
+                Err(damaged) => {
+                    let former = options.folder.join(FORMER);
+                    let Ok(there) = checkpoint::load(&former, &mut learner, &device) else {
+                        return Err(damaged.into());
+                    };
+                    watch.note(&format!("{damaged}; the run goes on from the state before it"));
+                    there
+                }
+                Ok(there) => there,
+            };
             if let Some(refusal) = identity.refusal(&there, options.force) {
                 return Err(FileError::unsuitable(&state, refusal).into());
             }
@@ -270,7 +283,8 @@ impl<'a, T: Task> Session<'a, T> {
             let validated = self.validate();
             self.spared("validation", validated)?;
         }
-        if due(t.preview_every) {
+        // The first validation has a preview as well, so that a wrong training is seen early.
+        if due(t.preview_every) || t.preview_every > 0 && now == t.validate_every as u64 {
             let previewed = self.preview();
             self.spared("preview", previewed)?;
         }
@@ -376,7 +390,15 @@ fn write_weights<T: Task>(learner: &Learner<T>, networks: &Networks, path: &Path
 fn save_state<T: Task>(path: &Path, learner: &Learner<T>, identity: &Identity) -> Result<(), TrainError> {
     let folder = path.parent().expect("lies in a folder");
     fs::create_dir_all(folder).map_err(FileError::write(folder))?;
-    Ok(checkpoint::save(path, learner, identity)?)
+    let [next, former] = ["next", "former"].map(|name| path.with_file_name(format!("{name}.safetensors")));
+    let _ = fs::remove_file(&next);
+    // Where files cannot have two names, there is only one state.
+    let is_kept = fs::hard_link(path, &next).is_ok();
+    checkpoint::save(path, learner, identity)?;
+    if is_kept {
+        file::rename(&next, &former).map_err(FileError::write(&former))?;
+    }
+    Ok(())
 }
 
 /// Runs `work` on the best thread for its device. For the CPU it is a thread of rayon's pool, since any other thread

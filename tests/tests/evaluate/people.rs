@@ -36,24 +36,6 @@ fn aligned_models_have_smaller_errors_and_the_report_says_how_they_moved() {
 }
 
 #[test]
-fn a_packed_data_set_has_the_figures_of_its_folders() {
-    let temporary = tempfile::tempdir().expect("a folder");
-    let packed = temporary.path().join("packed");
-    succeed(snapsnap().args(["prepare", "pack"]).arg(people()).arg("-o").arg(&packed));
-    let run = |data: &Path| {
-        let report = temporary.path().join(if data == packed { "archives" } else { "folders" });
-        let mean = format!("baselines.mean=[{:?}]", data.display().to_string());
-        let set = ["--set", &mean, "--set", "metrics.mesh=false", "--set", "views.compared=[1]"];
-        succeed(&mut evaluate(data, &report, &set));
-        json(&report)
-    };
-    let (folders, archives) = (run(people()), run(&packed));
-    for key in ["protocols", "points_mm", "baselines", "left_out"] {
-        assert!(!folders[key].is_null() && folders[key] == archives[key], "{key}: {}", archives[key]);
-    }
-}
-
-#[test]
 fn a_report_has_its_keys_and_follows_from_its_tables() {
     let temporary = tempfile::tempdir().expect("a folder");
     let report = temporary.path().join("new/report");

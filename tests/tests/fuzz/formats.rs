@@ -99,11 +99,22 @@ pub fn all() -> Vec<Format> {
         // A mesh takes seconds, hence few cases.
         format("gaussians-mesh", "rod.ply", "mesh in/rod.ply --faces 500 --device cpu -o out.ply").cases(1),
         format("cameras", "cameras.json", "render in/h.ply --cameras in/cameras.json --device cpu -o out"),
+        format(
+            "cameras-of-splatting",
+            "splatting.json",
+            "render in/h.ply --cameras in/splatting.json --device cpu -o out",
+        ),
+        format(
+            "cameras-of-fields",
+            "transforms.json",
+            "render in/h.ply --cameras in/transforms.json --device cpu -o out",
+        ),
         prepare("obj", ".obj .mtl .png .tiff", "scan in/a.obj"),
         prepare("mesh-ply", "mesh.ply", "scan in/mesh.ply"),
         prepare("mesh-ply-big-endian", "mesh_big_endian.ply", "scan in/mesh_big_endian.ply"),
         prepare("mesh-ply-ascii", "mesh_ascii.ply", "scan in/mesh_ascii.ply"),
         prepare("glb", "a.glb", "scan in/a.glb").cases(40),
+        prepare("glb-odd", "odd.glb", "scan in/odd.glb").cases(40),
         // The first character is for test.
         prepare("avatars", "b_suit.glb", "avatars in/avatars --subjects 1"),
         // The people whose files are sound are made.
@@ -114,7 +125,6 @@ pub fn all() -> Vec<Format> {
         prepare("makehuman", body, "makehuman in/makehuman --subjects 1 --seed 2"),
         format("data-set", "dataset.toml .png .npz .json", "prepare check in/set"),
         format("data-set-authors", "dataset.toml .jpg .png .npy", "prepare check in/set_32_2"),
-        format("data-set-packed", "dataset.toml archives.csv .tar", "prepare check in/packed"),
         rehearse("train-config", "train-stage1"),
         rehearse("train-config-stage2", "train-stage2 --weights in/w.safetensors"),
         format("evaluation", evaluated, &format!("{evaluate} {model}")).cases(20),

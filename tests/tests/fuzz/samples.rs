@@ -1,14 +1,18 @@
 //! Small sound samples: files of this repository, and files that the program or its libraries write.
 
 use std::fs;
+use std::io::Cursor;
 use std::path::Path;
 
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
 use glam::Vec3;
-use image::{DynamicImage, GrayImage, Luma};
+use image::{DynamicImage, GrayImage, ImageFormat, Luma};
+use serde_json::json;
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::{export, import};
 use snapsnap_splat::{Camera, camera_file};
-use snapsnap_tests::character::character;
+use snapsnap_tests::character::{character, glb};
 use snapsnap_tests::ply::{Format, Row, balls, cloud, ply_bytes};
 use snapsnap_tests::workplace::person;
 use snapsnap_tests::{TRAINING, data, exif, root, snapsnap, succeed};
@@ -47,10 +51,16 @@ f 2/1/1 5/3/1 3/2/1
 usemtl m1
 f 3//1 5//1 4//1
 f 4//1 5//1 1//1
-f 1//1 2//1 3//1 4//1
+f 1//1 2//1 \\
+3//1 4//1
 ";
 const MATERIALS: &str =
-    "newmtl m0\nKd 1 1 1\nmap_Kd a.png\nnewmtl m1\nKd 0.2 0.4 0.6\nmap_Kd -s 1 1 1 a.tiff\n";
+    "newmtl m0\nKd 1 1 1\nmap_kd A.png\nnewmtl m1\nKd 0.2 0.4 0.6\nmap_Kd -s 1 1 1 a.tiff\n";
+/// Cameras of other programs.
+const SPLATTING: &str = r#"[{"id": 0, "img_name": "a", "width": 24, "height": 16, "position": [0, 1, 3],
+    "rotation": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "fx": 20.5, "fy": 20.5}]"#;
+const TRANSFORMS: &str = r#"{"camera_angle_x": 0.6, "w": 24, "h": 16.0, "k1": 0, "frames": [{"file_path": "a",
+    "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 1], [0, 0, 1, 3], [0, 0, 0, 1]]}]}"#;
 /// An element that is skipped.
 const EDGE: &str = "element edge 1\nproperty list uchar uchar ends\n";
 
@@ -125,6 +135,9 @@ pub fn make(folder: &Path, name: &str) {
             save(&folder.join("a.png"), person(8, 8, 0, 0));
             save(&folder.join("a.tiff"), person(8, 8, 0, 0));
         }
+        "odd.glb" => put(&path, odd_glb()),
+        "splatting.json" => put(&path, SPLATTING),
+        "transforms.json" => put(&path, TRANSFORMS),
         "a.glb" => export::write(&pyramid(folder), &path).expect("written"),
         "mesh.ply" => put(&path, mesh_ply(&pyramid(folder), Format::Double)),
         "mesh_big_endian.ply" => put(&path, mesh_ply(&pyramid(folder), Format::Big)),
@@ -152,13 +165,45 @@ pub fn make(folder: &Path, name: &str) {
         }
         "set" => prepare(folder, "train", 2, "set"),
         "set_32_2" => prepare(folder, "train", 2, "set_32_2 --set views.layout=authors"),
-        "packed" => {
-            make(folder, "set");
-            run(folder, "prepare pack set -o packed");
-            fs::remove_dir_all(folder.join("set")).expect("removed");
-        }
         _ => panic!("no sample {name}"),
     }
+}
+
+/// A triangle of quantised positions with a cut-out, moved texture on a specular material.
+fn odd_glb() -> Vec<u8> {
+    let positions: [i16; 12] = [0, 0, 0, 0, 30_000, 0, 0, 0, 0, 30_000, 0, 0];
+    let places = [0.0_f32, 1.0, 1.0, 1.0, 0.0, 0.0];
+    let mut picture = Cursor::new(Vec::new());
+    person(8, 8, 0, 0).write_to(&mut picture, ImageFormat::Png).expect("encoded");
+    let uri = format!("data:image/png;base64,{}", BASE64_STANDARD.encode(picture.into_inner()));
+    let blob: Vec<u8> = positions
+        .iter()
+        .flat_map(|v| v.to_le_bytes())
+        .chain(places.iter().flat_map(|v| v.to_le_bytes()))
+        .collect();
+    let texture = json!({ "index": 0, "extensions": { "KHR_texture_transform": { "offset": [0.1, 0.2], "rotation": 0.3, "scale": [0.5, 2] } } });
+    let specular = json!({ "KHR_materials_pbrSpecularGlossiness": { "diffuseTexture": texture } });
+    let description = json!({
+        "asset": { "version": "2.0" },
+        "extensionsRequired": ["KHR_mesh_quantization"],
+        "scenes": [{ "nodes": [0] }],
+        "nodes": [{ "mesh": 0, "scale": [2, 2, 2] }],
+        "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0, "TEXCOORD_0": 1 }, "material": 0 }] }],
+        "materials": [{ "alphaMode": "MASK", "alphaCutoff": 0.4, "extensions": specular }],
+        "textures": [{ "source": 0 }],
+        "images": [{ "uri": uri }],
+        "accessors": [
+            { "bufferView": 0, "componentType": 5122, "normalized": true, "count": 3, "type": "VEC3",
+              "min": [0, 0, 0], "max": [30000, 30000, 0] },
+            { "bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2" },
+        ],
+        "bufferViews": [
+            { "buffer": 0, "byteLength": 24, "byteStride": 8 },
+            { "buffer": 0, "byteOffset": 24, "byteLength": 24 },
+        ],
+        "buffers": [{ "byteLength": blob.len() }],
+    });
+    glb(&description, &blob)
 }
 
 /// Writes a file, and the folders around it.

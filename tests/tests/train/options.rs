@@ -104,7 +104,7 @@ fn validations_of_sixteen_bits_are_close_to_thirty_two() {
         let run = temporary.path().join(format!("two-{precision}"));
         let set = format!("--set=training.precision={precision}");
         let mut command = train(2, &config, &run);
-        command.args([&set, "--set=training.seed=1", "--set=training.steps=20", "--set=optimizer.rate=1e-3"]);
+        command.args([&set, "--set=training.seed=1", "--set=training.steps=30", "--set=optimizer.rate=1e-3"]);
         succeed(command.arg("--set=optimizer.muon.rate=1e-3").arg("--weights").arg(&start));
         let scores = logged(&run, "validation/psnr_masked");
         (scores[0].1, scores[1].1)

@@ -10,7 +10,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use snapsnap_tests::{limited, refused, snapsnap, succeed};
 
-use super::{logged, people, place, results, train, train_on};
+use super::{logged, place, results, train};
 
 /// Kills a training at random moments until it is done. Returns how often it was killed.
 fn killed_at_random(command: impl Fn() -> Command, random: &mut ChaCha8Rng, most: u32) -> u32 {
@@ -92,32 +92,6 @@ fn sessions_after_a_time_limit_or_an_interrupt_end_with_the_same_bytes() {
     assert!(results(&whole) == before);
 }
 
-/// A packed data set gives the same bytes, also to a run that began with folders.
-#[test]
-fn packed_people_give_the_bytes_of_their_folders() {
-    let (temporary, config) = place();
-    let packed = temporary.path().join("packed");
-    succeed(snapsnap().args(["prepare", "pack"]).arg(people()).arg("-o").arg(&packed));
-    let predictor = temporary.path().join("folders-1/last.safetensors");
-    for stage in [1, 2] {
-        let [folders, archives, mixed] =
-            ["folders", "archives", "mixed"].map(|name| temporary.path().join(format!("{name}-{stage}")));
-        let on = |data: &Path, run: &Path| {
-            let mut command = train_on(data, stage, &config, run);
-            if stage == 2 {
-                command.arg("--weights").arg(&predictor);
-            }
-            command
-        };
-        succeed(&mut on(people(), &folders));
-        succeed(&mut on(&packed, &archives));
-        assert!(results(&folders) == results(&archives), "stage {stage}: other bytes");
-        succeed(on(people(), &mixed).args(["--minutes", "0.001"]));
-        succeed(on(&packed, &mixed).arg("--resume"));
-        assert!(results(&folders) == results(&mixed), "stage {stage}: other bytes after a change");
-    }
-}
-
 /// A limit on the size of files imitates a full disk. The log fits, the checkpoint does not.
 #[cfg(unix)]
 #[test]
@@ -153,6 +127,7 @@ fn a_damaged_state_is_refused_and_changes_nothing() {
     }
     for bytes in damaged {
         fs::write(&state, &bytes).expect("writes");
+        let _ = fs::remove_file(run.join("state/former.safetensors"));
         let output = train(1, &config, &run).args(["--resume", "--set", "training.steps=2"]).output();
         let output = output.expect("runs");
         let said = String::from_utf8_lossy(&output.stderr);
@@ -166,4 +141,30 @@ fn a_damaged_state_is_refused_and_changes_nothing() {
             fs::write(run.join(name), bytes).expect("writes");
         }
     }
+}
+
+/// After a power failure, a run goes on from the state before the damaged one and has the same end.
+#[test]
+fn a_run_with_a_damaged_state_goes_on_from_the_state_before() {
+    let (temporary, config) = place();
+    let run = temporary.path().join("run");
+    succeed(train(1, &config, &run).args(["--set", "training.steps=4"]));
+    let (before, state) = (results(&run), run.join("state/state.safetensors"));
+    fs::write(&state, &before[2][..before[2].len() / 2]).expect("writes");
+    let output =
+        train(1, &config, &run).args(["--resume", "--set", "training.steps=4"]).output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("goes on from the state before it"), "{said}");
+    assert!(results(&run) == before, "another end");
+    // A number of steps beyond every training is no sign of a finished one.
+    let length = 8 + u64::from_le_bytes(before[2][..8].try_into().expect("eight bytes")) as usize;
+    let header = String::from_utf8(before[2][8..length].to_vec()).expect("text");
+    let grown = header.replace("\\\"step\\\":4,", "\\\"step\\\":4000000000000000000,");
+    assert_ne!(header, grown);
+    let mut bytes = (grown.len() as u64).to_le_bytes().to_vec();
+    bytes.extend(grown.bytes().chain(before[2][length..].iter().copied()));
+    fs::write(&state, bytes).expect("writes");
+    fs::remove_file(run.join("state/former.safetensors")).expect("is there");
+    let said = refused(train(1, &config, &run).args(["--resume", "--set", "training.steps=4"]));
+    assert!(said.contains("tells of 4000000000000000000 steps"), "{said}");
 }

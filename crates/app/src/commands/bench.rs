@@ -15,7 +15,7 @@ use crate::arguments::check_utf8;
 use crate::failure::Failure;
 use crate::output::outside_data;
 use crate::progress::Progress;
-use crate::report::{ReportFolder, complete, header, nothing_left};
+use crate::report::{ReportFolder, complete, header, nothing_left, print_left_out};
 use crate::{device, memory, perceptual, say};
 
 /// Prefix of the line with the figures of a process that measures one setting.
@@ -83,7 +83,14 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
             Err(why) => left_out.push(LeftOut::new(run.display().to_string(), why)),
         }
     }
-    for (name, _) in Progress::over(variants.iter(), "settings") {
+    let mut absent = Vec::new();
+    for (name, variant) in Progress::over(variants.iter(), "settings") {
+        // Another machine has the device: no failure.
+        if let Some(Err(why)) = variant.device.as_deref().map(device::choose) {
+            left_out.push(LeftOut::new(name, &why));
+            absent.push(name);
+            continue;
+        }
         match in_process(name) {
             Ok(found) => measured.push(found),
             Err(why) => left_out.push(LeftOut::new(name, why)),
@@ -108,7 +115,10 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         say::info(&format!("{:<24} {:>8.1} ms   {:>6.2} dB   {by}", m.name, 1e3 * m.p50, m.score.psnr));
     }
     say::info(&format!("{}: report.md, report.json, plots and a table", folder.path.display()));
-    complete(&report.failures(), "the rest was measured")
+    let (left_out, failed): (Vec<_>, _) =
+        report.failures().into_iter().partition(|failure| absent.contains(&&failure.name));
+    print_left_out(&left_out);
+    complete(&failed, "the rest was measured")
 }
 
 fn config_of(arguments: &Arguments) -> Result<BenchConfig, Failure> {

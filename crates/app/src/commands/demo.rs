@@ -96,7 +96,9 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
 
     let mut text = header.markdown("Demo");
     text += &format!(
-        "* {} Gaussians in {seconds:.1} s, photographs and weights read; all of it in {:.1} s\n\n\
+        "* {} Gaussians in {seconds:.1} s, photographs and weights read; all of it in {:.1} s\n\
+         * The photographs are the canvases, as with `--as-is`: a few Gaussians fewer or more than `reconstruct` makes of \
+         them\n\n\
          ![turntable](turntable.png)\n\nThe photographs, then unseen views beside the ground truth:\n\n\
          ![comparison](comparison.png)\n\n| seen from | PSNR on the person, dB |\n|---|---|\n",
         world.len(),

@@ -155,8 +155,15 @@ impl Target {
         }
         let bytes = TEXEL * (texture as u64).pow(2);
         memory::check(&format!("--texture {texture}"), bytes, "choose a smaller one")?;
+        let companions = export::companions(path, texture > 0);
+        if let Some(other) = companions.iter().find(|other| !path.exists() && other.exists()) {
+            return Err(Failure::file(
+                other,
+                "would be replaced, but belongs to no mesh of this name: move it away",
+            ));
+        }
         let options = Options { faces: surface.faces.unwrap_or(defaults.faces), texture, ..defaults };
-        Ok(Self { path: path.to_owned(), companions: export::companions(path, texture > 0), options })
+        Ok(Self { path: path.to_owned(), companions, options })
     }
 
     pub fn files(&self) -> Vec<&Path> {

@@ -13,7 +13,7 @@ use snapsnap_mesh::picture;
 use snapsnap_net::config::Config;
 use snapsnap_net::precision::Precision;
 use snapsnap_ops::bf16;
-use snapsnap_photo::{Cutting, Person, Photographs, Source, Told};
+use snapsnap_photo::{Cutting, NoPerson, Person, Photographs, Source, Told};
 use snapsnap_splat::scene::Stored;
 
 use super::convert::AxesArguments;
@@ -191,9 +191,12 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let (networks, precision) = arguments.model.load(&weights, &device)?;
     timed("loading weights", since);
     let person = snapsnap_photo::person(&photographs, &networks, &told, &|name| progress.stage(name));
-    let Person { gaussians, seats, mut made } = person.map_err(|none| {
-        let steps: String = none.steps.iter().map(|step| format!("\n  {step}")).collect();
-        Failure::file(weights.path(), format!("{none}, so nothing was written; the steps:{steps}"))
+    let Person { gaussians, seats, mut made } = person.map_err(|none| match &none {
+        NoPerson::Empty { steps } => {
+            let steps: String = steps.iter().map(|step| format!("\n  {step}")).collect();
+            Failure::file(weights.path(), format!("{none}, so nothing was written; the steps:{steps}"))
+        }
+        NoPerson::Camera { .. } => Failure::Input(none.to_string()),
     })?;
     times.append(&mut made.times);
 

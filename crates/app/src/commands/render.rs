@@ -197,7 +197,7 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
 fn views(arguments: &Arguments) -> Result<Vec<Camera>, Failure> {
     let views = match (&arguments.cameras, arguments.orbit.unwrap_or(0)) {
         (Some(path), _) => {
-            let mut views = camera_file::read(path)?;
+            let mut views = camera_file::read_any(path, arguments.size)?;
             if let Some(size) = arguments.size {
                 resize(&mut views, size, path)?;
             }

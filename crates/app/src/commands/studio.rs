@@ -1,10 +1,10 @@
 //! `snapsnap studio`: a page (crates/app/viewer) that makes people of photographs, all in this process's memory.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::io::Cursor;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use clap::Args;
@@ -23,7 +23,7 @@ use crate::downloads::{self, Download};
 use crate::failure::Failure;
 use crate::model::{CameraArguments, ModelArguments, check_memory};
 use crate::page::{self, Job, PageArguments, text};
-use crate::server::{Answer, Body, Refusal, Request};
+use crate::server::{self, Answer, Body, Refusal, Request};
 
 #[derive(Args)]
 pub struct Arguments {
@@ -51,11 +51,17 @@ struct Studio {
     /// For one job at a time.
     networks: Mutex<Reconstructor>,
     /// The last people, under their names in addresses.
-    people: Mutex<VecDeque<(String, Arc<Stored>)>>,
+    people: Mutex<VecDeque<(String, Arc<Person>)>>,
     /// Number of people so far.
     made: AtomicUsize,
     /// Start of this server, a part of names: a page of an earlier server finds none of its people here.
     start: u128,
+}
+
+/// A person, and its files that clients are reading, by extension.
+struct Person {
+    stored: Stored,
+    files: Mutex<HashMap<&'static str, Weak<server::Bytes>>>,
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
@@ -87,10 +93,15 @@ impl Studio {
         }
     }
 
-    /// The networks, after all earlier jobs.
-    fn networks(&self, job: &Job) -> MutexGuard<'_, Reconstructor> {
+    /// The networks, after all earlier jobs. Refuses a client that has left meanwhile.
+    fn networks(&self, job: &Job, body: &Body) -> Result<MutexGuard<'_, Reconstructor>, Answer> {
         job.step("waiting for another page");
-        self.networks.lock().unwrap_or_else(PoisonError::into_inner)
+        let networks = self.networks.lock().unwrap_or_else(PoisonError::into_inner);
+        if body.is_awaited() {
+            Ok(networks)
+        } else {
+            Err(text(StatusCode::REQUEST_TIMEOUT, "the page was closed"))
+        }
     }
 
     /// A photograph → its picture, as JPEG, and the person's mask, as PNG, both reduced to [`PREVIEW`]; as JSON the
@@ -100,7 +111,7 @@ impl Studio {
         let job = Job::of(request);
         let name = Path::new("this photograph");
         check_memory(name, picture::size_of_bytes(name, upload.as_ref())?)?;
-        let networks = self.networks(&job);
+        let networks = self.networks(&job, body)?;
         job.step("removing the background");
         let source = Source { content: Content::Bytes(upload.as_ref()), ..Source::file(name) };
         let Figure { rgb, mask, joints, signs } = cut_out(source, Cutting::Missing)?;
@@ -139,6 +150,8 @@ impl Studio {
         for (name, bytes) in names.into_iter().zip(photographs) {
             check_memory(name, picture::size_of_bytes(name, bytes)?)?;
         }
+        let networks = self.networks(&job, body)?;
+        // Decoded strokes are larger than an upload: only one job at a time has them.
         let front_strokes = strokes("front strokes", front_strokes)?;
         let back_strokes = strokes("back strokes", back_strokes)?;
         let all = [front_strokes.as_ref(), back_strokes.as_ref()];
@@ -146,8 +159,6 @@ impl Studio {
             let content = Content::Bytes(photographs[i]);
             Source { content, strokes: all[i], ..Source::file(names[i]) }
         };
-
-        let networks = self.networks(&job);
         job.step("photographs");
         let (config, told) = (networks.config(), &self.told);
         let (side, placement) = (config.network.resolution, told.placement(config));
@@ -170,7 +181,7 @@ impl Studio {
         let gaussians = stored.len();
         let mut people = self.people.lock().unwrap_or_else(PoisonError::into_inner);
         people.truncate(KEPT - 1);
-        people.push_front((name.clone(), Arc::new(stored)));
+        people.push_front((name.clone(), Arc::new(Person { stored, files: Mutex::default() })));
         let seconds = start.elapsed().as_secs_f64();
         let made = json!({ "name": name, "gaussians": gaussians, "seconds": seconds, "warnings": doubts });
         Ok(page::answer("application/json", Arc::new(made.to_string())))
@@ -183,12 +194,25 @@ impl Studio {
             path.strip_prefix("/people/").and_then(|rest| rest.split_once('/')).ok_or_else(none)?;
         let (extension, download) = Download::named(file).ok_or_else(none)?;
         let people = self.people.lock().unwrap_or_else(PoisonError::into_inner);
-        let found = people.iter().find(|(other, _)| other == name).map(|(_, stored)| stored.clone());
+        let found = people.iter().find(|(other, _)| other == name).map(|(_, person)| person.clone());
         drop(people);
         let message = format!("this person is no longer in memory (the last {KEPT} are kept): make it again");
-        let stored = found.ok_or_else(|| text(StatusCode::NOT_FOUND, &message))?;
+        let person = found.ok_or_else(|| text(StatusCode::NOT_FOUND, &message))?;
         downloads::answer(request, "human", (extension, download), |step| {
-            Ok(Arc::new(download.make(&stored, step)?))
+            let files = || person.files.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(content) = files().get(extension).and_then(Weak::upgrade) {
+                return Ok(content);
+            }
+            // Long work must not keep other files waiting.
+            let made = if download.is_long() { Some(download.make(&person.stored, step)?) } else { None };
+            let mut files = files();
+            let content: server::Content = match (made, files.get(extension).and_then(Weak::upgrade)) {
+                (Some(made), _) => Arc::new(made),
+                (None, Some(content)) => content,
+                (None, None) => Arc::new(download.make(&person.stored, step)?),
+            };
+            files.insert(extension, Arc::downgrade(&content));
+            Ok(content)
         })
     }
 }

@@ -3,6 +3,17 @@
 /** Milliseconds between two questions about progress. */
 const INTERVAL = 300;
 
+/** Fetches without caches. Browsers only say "Failed to fetch" if the server ended or a chosen file changed. */
+export async function fetched(path, options) {
+  const answer = await fetch(path, { ...options, cache: "no-store" }).catch(() => {
+    throw new Error("the program has ended, or the file has changed since it was chosen: choose it again");
+  });
+  if (!answer.ok) {
+    throw new Error(await answer.text());
+  }
+  return answer;
+}
+
 /** Sends a request, and calls `step` with the name of each step of the server's work for it. */
 export async function ask(path, options, step) {
   const job = crypto.randomUUID();
@@ -17,11 +28,7 @@ export async function ask(path, options, step) {
     }
   }, INTERVAL);
   try {
-    const answer = await fetch(path, { ...options, headers, cache: "no-store" });
-    if (!answer.ok) {
-      throw new Error(await answer.text());
-    }
-    return answer;
+    return await fetched(path, { ...options, headers });
   } finally {
     open = false;
     clearInterval(timer);

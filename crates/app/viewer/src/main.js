@@ -3,6 +3,7 @@
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { fetched } from "./asking.js";
 import { inBatches } from "./batches.js";
 import { bounds, nearestTo } from "./gaussians.js";
 import { listen } from "./keys.js";
@@ -197,11 +198,7 @@ async function show(what, read) {
 }
 
 async function served() {
-  // The current file, without caches.
-  const answer = await fetch(`${address}scene.ply`, { cache: "no-store" });
-  if (!answer.ok) {
-    throw new Error(await answer.text());
-  }
+  const answer = await fetched(`${address}scene.ply`);
   const name = decodeURIComponent(answer.headers.get("x-name") ?? "scene.ply");
   return { bytes: new Uint8Array(await answer.arrayBuffer()), name, type: SplatFileType.PLY, served: true };
 }

@@ -31,7 +31,7 @@ export class Drawing {
       if (this.picture && event.button === 0 && !this.current) {
         canvas.setPointerCapture(event.pointerId);
         this.pointer = event.pointerId;
-        this.current = { keeps: this.keeps, width: this.width * Math.max(canvas.width, canvas.height), points: [] };
+        this.current = { keeps: this.keeps, width: this.width * Math.max(canvas.width, canvas.height), points: [], shown: 0 };
         this.lines.push(this.current);
         this.extend(event);
       }
@@ -104,8 +104,16 @@ export class Drawing {
 
   extend(event) {
     this.place(event);
-    this.onMask(this.current);
-    this.show();
+    const { points, shown } = this.current;
+    this.onMask({ ...this.current, points: points.slice(Math.max(shown - 1, 0)) });
+    this.current.shown = points.length;
+    // Events may come faster than frames.
+    this.frame ??= requestAnimationFrame(() => {
+      this.frame = null;
+      if (this.picture) {
+        this.show();
+      }
+    });
   }
 
   /** Draws a line in a color. */

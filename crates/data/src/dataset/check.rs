@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::consistency::{LEAST_SIDE, Seen, disagreements};
 use super::views::split_alpha;
 use super::write::UNFINISHED;
-use super::{Arrangement, DepthMap, Description, Folder, Layout, Person, Split};
+use super::{Arrangement, DepthMap, Description, Folder, Layout, Person, Split, names};
 use snapsnap_base::FileError;
 
 /// Largest share of the person without depth. Scans have gaps narrower than a pixel.
@@ -78,7 +78,7 @@ fn orphans(folder: &Folder, split: Option<Split>, subjects: &[String]) -> Vec<St
     let mut problems = Vec::new();
     for kind in folder.kinds().iter().filter(|kind| **kind != "img") {
         let path = folder.split_path(split).join(kind);
-        for (name, _) in folder.names(&path).unwrap_or_default() {
+        for (name, _) in names(&path).unwrap_or_default() {
             let subject = name.strip_suffix(".json").unwrap_or(&name).to_owned();
             if !subjects.contains(&subject) {
                 problems.push(format!("{}: its subject has no pictures", path.join(name).display()));
@@ -95,7 +95,7 @@ fn unexpected(folder: &Folder, person: Person<'_>) -> Vec<String> {
     let mut extra = BTreeSet::new();
     for kind in folder.kinds().iter().filter(|kind| **kind != "cameras") {
         let path = person.path(kind);
-        for (name, _) in folder.names(&path).unwrap_or_default() {
+        for (name, _) in names(&path).unwrap_or_default() {
             let number: String = name.chars().take_while(char::is_ascii_digit).collect();
             if !number.parse().is_ok_and(|view: usize| view < views) {
                 extra.insert(format!("{}: belongs to none of the {views} views", path.join(name).display()));
@@ -140,7 +140,9 @@ fn faults(folder: &Folder, person: Person<'_>, view: usize) -> (Vec<String>, Opt
         .flat_map(|y| (0..width).map(move |x| (x, y)))
         .filter(|&(x, y)| depth[(y * width + x) as usize] <= 0.0 && inside(x, y))
         .count();
-    if missing > 4 && missing as f64 > HOLES * pixels.unwrap_or(0) as f64 {
+    // Gaps narrower than a pixel are lines.
+    let area = pixels.unwrap_or(0) as f64;
+    if missing as f64 > (HOLES * area).max(area.sqrt()) {
         report(format!("{missing} pixels of the person have no depth"));
     }
     if let Some(second) = second.flatten() {

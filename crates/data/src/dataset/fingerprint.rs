@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use snapsnap_base::{FileError, file};
 
-use super::{Folder, Split};
+use super::{Folder, Split, names};
 
 /// Bytes that are read at the beginning and at the end of a file. A PNG and a compressed array end with checksums of
 /// their content.
@@ -17,8 +17,7 @@ const ENDS: u64 = 4096;
 const MAX_DEPTH: usize = 3;
 
 impl Folder {
-    /// A hash of the description and of the files of `splits`: their names, lengths, beginnings and ends. A packed data
-    /// set has the same hash as its folders.
+    /// A hash of the description and of the files of `splits`: their names, lengths, beginnings and ends.
     ///
     /// # Errors
     /// [`FileError::Read`] for a file or folder that cannot be read.
@@ -26,41 +25,39 @@ impl Folder {
         let mut files = Vec::new();
         let there = self.splits();
         for split in splits.iter().map(|split| Some(*split)).filter(|split| there.contains(split)) {
-            self.list(&self.split_path(split), MAX_DEPTH, &mut files)?;
+            list(&self.split_path(split), MAX_DEPTH, &mut files)?;
         }
         files.sort_unstable();
         let hashes: Vec<_> = files
             .par_iter()
             .map(|path| {
-                let (length, bytes) = match &self.archives {
-                    Some(archives) => archives.ends(self.below(path), ENDS)?,
-                    None => ends(path).map_err(FileError::read(path))?,
-                };
+                let (length, bytes) = ends(path).map_err(FileError::read(path))?;
                 Ok(Sha256::new().chain_update(length.to_le_bytes()).chain_update(bytes).finalize())
             })
             .collect::<Result<_, FileError>>()?;
         let mut whole = Sha256::new();
         whole.update(toml::to_string(&self.description).expect("the description has only TOML types"));
         for (path, hash) in files.iter().zip(hashes) {
-            whole.update(self.below(path).to_string_lossy().as_bytes());
+            let below = path.strip_prefix(&self.root).unwrap_or(path);
+            whole.update(below.to_string_lossy().as_bytes());
             whole.update(hash);
         }
         Ok(format!("{:x}", whole.finalize()))
     }
+}
 
-    /// Adds the files below a folder. Hidden files are unfinished, and left out.
-    fn list(&self, folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<(), FileError> {
-        for (name, is_folder) in self.names(folder).map_err(FileError::read(folder))? {
-            let path = folder.join(&name);
-            match is_folder {
-                _ if name.starts_with('.') => {}
-                false => files.push(path),
-                true if depth > 1 => self.list(&path, depth - 1, files)?,
-                true => {}
-            }
+/// Adds the files below a folder. Hidden files are unfinished, and left out.
+fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<(), FileError> {
+    for (name, is_folder) in names(folder).map_err(FileError::read(folder))? {
+        let path = folder.join(&name);
+        match is_folder {
+            _ if name.starts_with('.') => {}
+            false => files.push(path),
+            true if depth > 1 => list(&path, depth - 1, files)?,
+            true => {}
         }
-        Ok(())
     }
+    Ok(())
 }
 
 /// Length, beginning and end of a file.

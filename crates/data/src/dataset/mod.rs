@@ -12,15 +12,13 @@
 //! ```
 //!
 //! A subject is added whole or not at all: it is written under another name, and its `img` folder, which marks a
-//! subject, is renamed last. [`pack()`] puts all files into tar archives, which are read as the folders are.
+//! subject, is renamed last.
 
-mod archives;
 mod check;
 mod consistency;
 mod description;
 mod files;
 mod fingerprint;
-mod pack;
 #[cfg(test)]
 mod tests;
 mod views;
@@ -30,15 +28,12 @@ use std::fmt::Display;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use snapsnap_base::{FileError, file};
 
-use archives::Archives;
 pub use check::{Checked, check};
 pub use description::DESCRIPTION;
 pub use description::{Arrangement, Description, Drawn, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
-pub use pack::{Packed, pack};
 use snapsnap_mesh::picture;
 pub(crate) use views::centres;
 pub use views::{DepthMap, Person};
@@ -52,8 +47,6 @@ const MAX_FILE: u64 = 1 << 30;
 pub struct Folder {
     root: PathBuf,
     description: Description,
-    /// The archives of a packed data set.
-    archives: Option<Arc<Archives>>,
 }
 
 /// A file that was read.
@@ -72,8 +65,7 @@ impl Folder {
         let path = root.join(DESCRIPTION);
         if path.is_file() {
             let description = description::read(&path)?;
-            let archives = Archives::open(root)?.map(Arc::new);
-            return Ok(Self { root: root.to_owned(), description, archives });
+            return Ok(Self { root: root.to_owned(), description });
         }
         fs::read_dir(root).map(drop).map_err(FileError::read(root))?;
         let foreign = |message: &str| {
@@ -94,7 +86,6 @@ impl Folder {
                 source: "written by the authors' tools".into(),
                 drawn: None,
             },
-            archives: None,
         };
         let (split, subject) = folder
             .splits()
@@ -128,12 +119,6 @@ impl Folder {
             return Err(FileError::unsuitable(root, message));
         }
         fs::create_dir_all(root).map_err(FileError::write(root))?;
-        if root.join(archives::INDEX).exists() {
-            return Err(FileError::unsuitable(
-                root,
-                "is packed, and no subjects can be added; give another folder",
-            ));
-        }
         let path = root.join(DESCRIPTION);
         if path.exists() {
             let there = description::read(&path)?;
@@ -147,7 +132,7 @@ impl Folder {
         } else {
             description::write(&path, &description)?;
         }
-        Ok(Self { root: root.to_owned(), description, archives: None })
+        Ok(Self { root: root.to_owned(), description })
     }
 
     /// The folder's path.
@@ -162,13 +147,7 @@ impl Folder {
 
     /// The splits of the data set; `None` is the root itself, as in the authors' test sets.
     pub fn splits(&self) -> Vec<Option<Split>> {
-        let there = |split: &Option<Split>| {
-            let folder = self.split_path(*split).join("img");
-            match &self.archives {
-                Some(archives) => archives.files(self.below(&folder)).next().is_some(),
-                None => folder.is_dir(),
-            }
-        };
+        let there = |split: &Option<Split>| self.split_path(*split).join("img").is_dir();
         std::iter::once(None).chain(Split::ALL.map(Some)).filter(there).collect()
     }
 
@@ -178,33 +157,17 @@ impl Folder {
     /// [`FileError::Read`] for a missing split.
     pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, FileError> {
         let folder = self.split_path(split).join("img");
-        let names = self.names(&folder).map_err(FileError::read(&folder))?;
+        let names = names(&folder).map_err(FileError::read(&folder))?;
         let folders = names.into_iter().filter(|(name, is_folder)| *is_folder && !name.starts_with('.'));
         let mut subjects: Vec<String> = folders.map(|(name, _)| name).collect();
         subjects.sort_unstable();
         Ok(subjects)
     }
 
-    /// Names in a folder of the data set, and whether they are folders.
-    fn names(&self, folder: &Path) -> io::Result<Vec<(String, bool)>> {
-        if let Some(archives) = &self.archives {
-            let names = archives.names(self.below(folder));
-            return if names.is_empty() { Err(io::ErrorKind::NotFound.into()) } else { Ok(names) };
-        }
-        let entry = |entry: io::Result<fs::DirEntry>| {
-            let entry = entry?;
-            Ok((entry.file_name().to_string_lossy().into_owned(), entry.path().is_dir()))
-        };
-        fs::read_dir(folder)?.map(entry).collect()
-    }
-
-    /// Reads a file of the data set. `path` is the file's path in a data set of folders, also if the set is packed.
+    /// Reads a file of the data set.
     fn stored(&self, path: &Path) -> Result<Stored, FileError> {
-        let (path, bytes) = match &self.archives {
-            Some(archives) => archives.read(self.below(path))?,
-            None => (path.to_owned(), file::read(path, self.largest()).map_err(FileError::read(path))?),
-        };
-        Ok(Stored { path, bytes })
+        let bytes = file::read(path, self.largest()).map_err(FileError::read(path))?;
+        Ok(Stored { path: path.to_owned(), bytes })
     }
 
     /// Largest size of a file in bytes: enough for all cameras, and for 16 bytes per pixel at twice the side.
@@ -212,11 +175,6 @@ impl Folder {
         let Description { resolution, views, .. } = self.description;
         let (pixels, views) = (u64::from(resolution).pow(2), views as u64);
         MAX_FILE.min((1 << 20) + 4096 * views + 64 * pixels)
-    }
-
-    /// A path below the root.
-    fn below<'a>(&self, path: &'a Path) -> &'a Path {
-        path.strip_prefix(&self.root).unwrap_or(path)
     }
 
     /// File name of a view's picture, mask or depth; `kind` is the name of the folder.
@@ -235,6 +193,15 @@ impl Folder {
             None => self.root.clone(),
         }
     }
+}
+
+/// Names in a folder, and whether they are folders.
+fn names(folder: &Path) -> io::Result<Vec<(String, bool)>> {
+    let entry = |entry: io::Result<fs::DirEntry>| {
+        let entry = entry?;
+        Ok((entry.file_name().to_string_lossy().into_owned(), entry.path().is_dir()))
+    };
+    fs::read_dir(folder)?.map(entry).collect()
 }
 
 /// The number after the last underscore of the folder's name.

@@ -1,4 +1,4 @@
-mod pack;
+use std::sync::Arc;
 
 use super::*;
 use crate::prepare::{DataConfig, Subject};

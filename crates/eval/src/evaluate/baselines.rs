@@ -14,7 +14,6 @@ use snapsnap_net::placed;
 use snapsnap_ops::{bilinear, host};
 use snapsnap_splat::{Camera, Gaussians};
 
-use super::model::joined;
 use super::person::{People, part_of, planes, smaller, test_of};
 use crate::EvalError;
 use crate::pictures::Picture;
@@ -35,7 +34,7 @@ pub fn billboard(
         let points = &upright(camera, side);
         in_world(geometric(&[CanvasView { view: View::Front, image, points, valid }], side, device), camera)
     };
-    joined(photographs.iter().zip(valid).zip(cameras).map(part).collect())
+    Gaussians::joined(&photographs.iter().zip(valid).zip(cameras).map(part).collect::<Vec<_>>())
 }
 
 /// Points at which the pixel rays of a camera meet the upright plane through the world's y axis that faces the camera:

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Device;
 use snapsnap_data::sample::{PhotographChanges, Road, TestItem};
 use snapsnap_net::config::{OPPOSITE, Precision, RotationFrame, WorldFrame};
 use snapsnap_net::network::View;
@@ -227,7 +227,7 @@ impl Model {
         if count > 1 {
             steps.insert(0, Step::Pairs { pairs: count });
         }
-        let gaussians = joined(parts);
+        let gaussians = Gaussians::joined(&parts);
         gaussians.device().sync().expect("the device finishes its work");
         let time = start.elapsed();
         if gaussians.is_empty() {
@@ -263,18 +263,4 @@ impl Model {
 
 pub(super) fn no_gaussian() -> EvalError {
     EvalError::Message("no Gaussian came out".into())
-}
-
-/// Concatenates several sets of Gaussians.
-pub fn joined(parts: Vec<Gaussians>) -> Gaussians {
-    let rows = |of: fn(&Gaussians) -> &Tensor<2>| {
-        Tensor::cat(parts.iter().map(|part| of(part).clone()).collect(), 0)
-    };
-    Gaussians {
-        means: rows(|part| &part.means),
-        rotations: rows(|part| &part.rotations),
-        scales: rows(|part| &part.scales),
-        opacities: Tensor::cat(parts.iter().map(|part| part.opacities.clone()).collect(), 0),
-        colors: rows(|part| &part.colors),
-    }
 }

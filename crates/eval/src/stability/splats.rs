@@ -40,6 +40,8 @@ pub fn cases() -> Vec<Case> {
         add(format!("needles 1:{ratio:.0e}"), equal, shaped([0.3, short, short]), camera);
         add(format!("discs 1:{ratio:.0e}"), equal, shaped([0.3, 0.3, short]), camera);
     }
+    // As in files of 2D Gaussians.
+    add("discs without thickness".into(), equal, shaped([0.3, 0.3, 0.0]), camera);
     for scale in [1e-8_f32, 1e-4, 1.0, 1e2, 1e4] {
         add(format!("all scales {scale:.0e} m"), equal, shaped([scale; 3]), camera);
     }

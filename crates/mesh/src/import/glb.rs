@@ -1,22 +1,21 @@
 //! Reads binary glTF 2.0: the triangles of the default scene with base colours, moved by nodes or skins, and its bones.
 
+use std::borrow::Cow;
 use std::collections::HashSet;
 use std::fmt::Display;
 use std::path::Path;
-use std::sync::Arc;
 
 use glam::{Mat4, Vec2, Vec3};
-use gltf::accessor::{DataType, Dimensions};
+use gltf::accessor::{DataType, Dimensions, Item, Iter};
 use gltf::json::Root;
 use gltf::mesh::Mode;
-use gltf::{Accessor, Document, Node, Primitive, image::Source};
-use image::RgbImage;
+use gltf::{Accessor, Document, Node, Primitive};
 use snapsnap_base::{FileError, file};
 
+use super::glb_material::{base, check_extensions, is_invisible, of_uri, shown, texture_set, transformed};
 use super::skin::moved;
 use super::{MAX_BYTES, Textures, add_colors};
 use crate::mesh::{Face, Material, Mesh};
-use crate::picture::decode_bytes;
 
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 256;
@@ -87,15 +86,25 @@ pub struct File<'a> {
 pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
     let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
     let invalid = |e: &dyn Display| FileError::unsuitable(path, format!("is no valid GLB: {e}"));
-    let parsed = gltf::Gltf::from_slice_without_validation(&bytes);
-    let gltf::Gltf { document, blob } = parsed.map_err(|e| invalid(&e))?;
+    let (json, mut blob) = if bytes.starts_with(b"glTF") {
+        let glb = gltf::Glb::from_slice(&bytes).map_err(|e| invalid(&e))?;
+        (glb.json, glb.bin.map_or_else(Vec::new, Cow::into_owned))
+    } else {
+        (Cow::from(&*bytes), Vec::new())
+    };
+    // Some exporters pad the text with zeros.
+    let json = &json[..json.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1)];
+    let mut root: Root = gltf::json::deserialize::from_slice(json).map_err(|e| invalid(&e))?;
     drop(bytes);
-    let root = document.into_json();
     check_references(&root).map_err(|e| invalid(&e))?;
+    check_extensions(&mut root).map_err(|e| FileError::unsuitable(path, e))?;
+    if let Some(uri) = root.buffers.first().and_then(|buffer| buffer.uri.as_deref()) {
+        blob = of_uri(uri).map_err(|e| FileError::unsuitable(path, format!("its data {e}")))?;
+    }
     let document = Document::from_json(root).map_err(|e| invalid(&e))?;
     let mut file = File {
         path,
-        blob: blob.unwrap_or_default(),
+        blob,
         rigged: Rigged::default(),
         textures: Textures::new(),
         nodes_left: document.nodes().len(),
@@ -132,7 +141,7 @@ fn check_references(root: &Root) -> Result<(), String> {
 impl File<'_> {
     fn add(&mut self, document: &Document) -> Result<(), FileError> {
         for material in document.materials() {
-            let material = self.material(&material)?;
+            let material = self.material(&material, document)?;
             self.rigged.mesh.materials.push(material);
         }
         // Primitives without a material are white.
@@ -150,25 +159,6 @@ impl File<'_> {
             self.primitive(&primitives[place.mesh][place.primitive], &place, &skins)?;
         }
         Ok(())
-    }
-
-    fn material(&mut self, material: &gltf::Material) -> Result<Material, FileError> {
-        let base = material.pbr_metallic_roughness();
-        let [r, g, b, _] = base.base_color_factor();
-        let texture = base.base_color_texture().map(|texture| self.texture(&texture.texture().source()));
-        // Factors are linear in glTF, colours of a mesh are sRGB.
-        let color = Vec3::new(r, g, b).clamp(Vec3::ZERO, Vec3::ONE).map(shown);
-        Ok(Material { color, texture: texture.transpose()? })
-    }
-
-    fn texture(&mut self, image: &gltf::Image) -> Result<Arc<RgbImage>, FileError> {
-        let Source::View { view, .. } = image.source() else {
-            return Err(self.wrong(format!("texture {} is not inside the file", image.index())));
-        };
-        let bytes =
-            view.offset().checked_add(view.length()).and_then(|end| self.blob.get(view.offset()..end));
-        let bytes = bytes.ok_or_else(|| self.wrong(format!("texture {} is cut off", image.index())))?;
-        self.textures.load(image.index(), |most| decode_bytes(self.path, bytes, most))
     }
 
     fn node(&mut self, node: &Node, parent: Option<usize>, depth: usize) -> Result<(), FileError> {
@@ -210,7 +200,8 @@ impl File<'_> {
 
     fn primitive(&mut self, primitive: &Primitive, place: &Place, skins: &Skins) -> Result<(), FileError> {
         let mode = primitive.mode();
-        if !matches!(mode, Mode::Triangles | Mode::TriangleStrip | Mode::TriangleFan) {
+        let is_drawn = matches!(mode, Mode::Triangles | Mode::TriangleStrip | Mode::TriangleFan);
+        if !is_drawn || is_invisible(&primitive.material()) {
             return Ok(());
         }
         let set = texture_set(primitive);
@@ -224,7 +215,9 @@ impl File<'_> {
         // A skin replaces the transform of the node.
         let to_world = joints.map_or(self.worlds[place.node].1, |_| Mat4::IDENTITY);
         let reader = primitive.reader(|_| Some(&self.blob));
-        let read = reader.read_positions().into_iter().flatten().map(Vec3::from_array);
+        let read =
+            primitive.get(&gltf::Semantic::Positions).into_iter().flat_map(|rows| self.numbers::<3>(&rows));
+        let read = read.map(Vec3::from_array);
         let positions: Vec<Vec3> = match joints {
             Some(joints) => read.zip(&weights).map(|(p, weights)| moved(p, weights, joints)).collect(),
             None => read.map(|p| to_world.transform_point3(p)).collect(),
@@ -232,12 +225,18 @@ impl File<'_> {
         for (row, _) in weights.iter_mut().flatten().filter(|(_, share)| *share > 0.0) {
             *row = joints.map_or(*row, |joints| joints[*row as usize].0);
         }
-        let texcoords: Vec<Vec2> = reader
-            .read_tex_coords(set)
+        let texture = base(&primitive.material()).1;
+        let texcoords = primitive.get(&gltf::Semantic::TexCoords(set));
+        let texcoords: Vec<Vec2> = texcoords
             .into_iter()
+            .flat_map(|rows| self.numbers::<2>(&rows))
+            .map(|at| texture.as_ref().map_or(at.into(), |texture| transformed(texture, at.into())))
             // The origin of glTF's texture coordinates is at the top.
-            .flat_map(|t| t.into_f32().map(|[u, v]| Vec2::new(u, 1.0 - v)))
+            .map(|at| Vec2::new(at.x, 1.0 - at.y))
             .collect();
+        if texture.is_some() && texcoords.is_empty() && count > 0 {
+            return Err(self.wrong(format!("a primitive has a texture, but no `TEXCOORD_{set}`")));
+        }
         let colors: Vec<Vec3> = reader
             .read_colors(0)
             .into_iter()
@@ -288,14 +287,12 @@ impl File<'_> {
     /// Checks the accessors of a primitive with [`File::check`].
     fn check_accessors(&self, primitive: &Primitive) -> Result<(), FileError> {
         let shares: &[DataType] = &[DataType::U8, DataType::U16, DataType::F32];
+        // Whole numbers: `KHR_mesh_quantization`.
+        let numbers = [shares, &[DataType::I8, DataType::I16]].concat();
         let texcoords = gltf::Semantic::TexCoords(texture_set(primitive));
-        self.check(
-            "positions",
-            primitive.get(&gltf::Semantic::Positions),
-            &[DataType::F32],
-            &[Dimensions::Vec3],
-        )?;
-        self.check("texture coordinates", primitive.get(&texcoords), shares, &[Dimensions::Vec2])?;
+        let positions = primitive.get(&gltf::Semantic::Positions);
+        self.check("positions", positions, &numbers, &[Dimensions::Vec3])?;
+        self.check("texture coordinates", primitive.get(&texcoords), &numbers, &[Dimensions::Vec2])?;
         let colors = primitive.get(&gltf::Semantic::Colors(0));
         self.check("colours", colors, shares, &[Dimensions::Vec3, Dimensions::Vec4])?;
         let rows = [DataType::U8, DataType::U16, DataType::U32];
@@ -324,6 +321,9 @@ impl File<'_> {
             return Err(self.wrong(format!("accessor {index} is sparse, which scans are not")));
         }
         let view = accessor.view().ok_or_else(|| self.wrong(format!("accessor {index} has no data")))?;
+        if view.buffer().index() != 0 {
+            return Err(self.wrong(format!("accessor {index} lies outside the file")));
+        }
         let size = accessor.size();
         let stride = view.stride().unwrap_or(size);
         let end = accessor
@@ -337,20 +337,33 @@ impl File<'_> {
                 "accessor {index} promises {count} entries, more than the file holds; it may be cut off"
             )));
         }
-        if view.buffer().index() != 0 {
-            return Err(self.wrong(format!("accessor {index} lies outside the file")));
-        }
         Ok(())
     }
-}
 
-/// Index of the set of texture coordinates that the primitive's texture uses.
-fn texture_set(primitive: &Primitive) -> u32 {
-    let base = primitive.material().pbr_metallic_roughness();
-    base.base_color_texture().map_or(0, |texture| texture.tex_coord())
-}
+    /// The rows of a checked accessor. Normalised integers are shares of the largest one.
+    fn numbers<const N: usize>(&self, accessor: &Accessor) -> Vec<[f32; N]>
+    where
+        [i8; N]: Item,
+        [u8; N]: Item,
+        [i16; N]: Item,
+        [u16; N]: Item,
+        [f32; N]: Item,
+    {
+        let most = |most: f32| if accessor.normalized() { most } else { 1.0 };
+        match accessor.data_type() {
+            DataType::I8 => self.rows::<i8, N>(accessor, most(127.0)),
+            DataType::U8 => self.rows::<u8, N>(accessor, most(255.0)),
+            DataType::I16 => self.rows::<i16, N>(accessor, most(32_767.0)),
+            DataType::U16 => self.rows::<u16, N>(accessor, most(65_535.0)),
+            _ => self.rows::<f32, N>(accessor, 1.0),
+        }
+    }
 
-/// sRGB value of linear light.
-fn shown(linear: f32) -> f32 {
-    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+    fn rows<T: Into<f32>, const N: usize>(&self, accessor: &Accessor, most: f32) -> Vec<[f32; N]>
+    where
+        [T; N]: Item,
+    {
+        let rows = Iter::<[T; N]>::new(accessor.clone(), |_| Some(&self.blob));
+        rows.into_iter().flatten().map(|row| row.map(|value| value.into() / most)).collect()
+    }
 }

@@ -1,6 +1,7 @@
 //! Scans from files: OBJ with MTL and textures, PLY with vertex colours or a texture, GLB.
 
 mod glb;
+mod glb_material;
 mod obj;
 mod ply;
 mod skin;
@@ -12,8 +13,10 @@ use std::hash::Hash;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use image::{DynamicImage, RgbImage};
+use snapsnap_base::file::folder_of;
+use snapsnap_base::folder::entries;
 use snapsnap_base::{FileError, guarded, quoted};
 
 use crate::mesh::Mesh;
@@ -81,6 +84,44 @@ fn add_colors(mesh: &mut Mesh, first: usize, colors: impl ExactSizeIterator<Item
     }
 }
 
+/// Triangles of a polygon, as places in `corners`. A concave polygon is cut into ears, so that its gaps stay open.
+fn triangles(corners: &[Vec3]) -> Vec<[usize; 3]> {
+    /// Most corners of a polygon that is cut into ears, which takes their third power.
+    const MOST: usize = 512;
+    let n = corners.len();
+    let fan = |rows: &[usize]| (2..rows.len()).map(|i| [rows[0], rows[i - 1], rows[i]]).collect::<Vec<_>>();
+    let mut left: Vec<usize> = (0..n).collect();
+    let normal: Vec3 = (2..n).map(|i| (corners[i - 1] - corners[0]).cross(corners[i] - corners[0])).sum();
+    let Some(normal) = normal.try_normalize().filter(|_| (4..=MOST).contains(&n)) else { return fan(&left) };
+    let (x, y) = normal.any_orthonormal_pair();
+    let flat = corners.iter().map(|corner| {
+        let corner = *corner - corners[0];
+        Vec2::new(corner.dot(x), corner.dot(y))
+    });
+    let flat: Vec<Vec2> = flat.collect();
+    let turn = |[a, b, c]: [usize; 3]| (flat[b] - flat[a]).perp_dot(flat[c] - flat[b]);
+    if (0..n).all(|i| turn([i, (i + 1) % n, (i + 2) % n]) >= 0.0) {
+        return fan(&left);
+    }
+    let mut cut = Vec::new();
+    while left.len() > 3 {
+        let m = left.len();
+        let around = |i: usize| [left[(i + m - 1) % m], left[i], left[(i + 1) % m]];
+        let is_ear = |i: &usize| {
+            let [a, b, c] = around(*i);
+            let is_within =
+                |p: &usize| [[a, b, *p], [b, c, *p], [c, a, *p]].into_iter().all(|t| turn(t) >= 0.0);
+            turn([a, b, c]) > 0.0 && !left.iter().any(|p| ![a, b, c].contains(p) && is_within(p))
+        };
+        // The outline of a polygon that crosses itself has no ear.
+        let Some(ear) = (0..m).find(is_ear) else { break };
+        cut.push(around(ear));
+        left.remove(ear);
+    }
+    cut.extend(fan(&left));
+    cut
+}
+
 /// Textures of one scan, each decoded once.
 struct Textures<K> {
     loaded: HashMap<K, Arc<RgbImage>>,
@@ -127,11 +168,17 @@ impl Textures<PathBuf> {
 /// The file to which `owner` refers as `name`: relative to the folder of `owner`, or else the file name alone in this
 /// folder, since scans contain paths of other machines.
 fn beside(owner: &Path, kind: &str, name: &str) -> Result<PathBuf, FileError> {
-    let folder = owner.parent().unwrap_or(Path::new(""));
+    let folder = folder_of(owner);
     let slashes = name.replace('\\', "/");
     let last = slashes.rsplit('/').next().unwrap_or_default();
     let mut paths = [name, &slashes, last].into_iter().map(|name| folder.join(name));
+    // Other systems do not distinguish capitals.
+    let alike = || {
+        let mut names = entries(folder).ok()?.into_iter();
+        names.find(|path| path.file_name().is_some_and(|found| found.eq_ignore_ascii_case(last)))
+    };
     paths
         .find(|path| path.is_file())
+        .or_else(alike)
         .ok_or_else(|| FileError::unsuitable(owner, format!("its {kind} `{}` is missing", quoted(name))))
 }

@@ -1,14 +1,12 @@
 //! Wavefront OBJ: polygons with several materials and textures, vertex colours.
 
-use std::cell::Cell;
-use std::collections::HashMap;
+use std::borrow::Cow;
 use std::path::Path;
 
 use glam::{Vec2, Vec3};
 use snapsnap_base::{FileError, file, quoted};
-use tobj::{LoadError, LoadOptions};
 
-use super::{MAX_BYTES, Textures, add_colors, beside};
+use super::{MAX_BYTES, Textures, beside, triangles};
 use crate::mesh::{Face, Material, Mesh};
 
 /// Longest line in bytes.
@@ -16,123 +14,231 @@ const MAX_LINE: usize = 1 << 20;
 /// Largest share of vertices at the end of a file that no face uses.
 const UNUSED: f64 = 0.05;
 
+/// The statements of a file.
+#[derive(Default)]
+struct Statements<'a> {
+    positions: Vec<Vec3>,
+    colors: Vec<Option<Vec3>>,
+    texcoords: Vec<Vec2>,
+    /// Position and texture coordinate of all faces' corners.
+    corners: Vec<(usize, Option<usize>)>,
+    faces: Vec<Polygon>,
+    /// Names after `usemtl`, and the line of each.
+    used: Vec<(usize, Cow<'a, str>)>,
+    /// The `mtllib` statements.
+    libraries: Vec<Cow<'a, str>>,
+    /// Number of vertices up to the last one that a face, a line or a point uses.
+    last: usize,
+    counts: Counts,
+}
+
+struct Polygon {
+    line: usize,
+    /// Number of corners.
+    corners: usize,
+    /// Number of `usemtl` statements before it.
+    material: usize,
+}
+
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
     let text = read_lossy(path)?;
     let wrong = |message: String| FileError::unsuitable(path, message);
-    if let Some(row) = text.lines().position(|line| line.len() > MAX_LINE) {
-        return Err(wrong(format!("line {}: longer than {MAX_LINE} bytes", row + 1)));
+    let mut read = Statements::default();
+    for (number, line) in statements(&text) {
+        read.add(number, &line).map_err(|e| match line.len() {
+            0..=MAX_LINE => wrong(format!("line {number}, `{}`: {e}", quoted(&line))),
+            _ => wrong(format!("line {number}: {e}")),
+        })?;
     }
-    let failed = Cell::new(None);
-    let fail = |e: FileError| {
-        failed.set(Some(e));
-        LoadError::MaterialParseError
-    };
-    let options =
-        LoadOptions { triangulate: true, ignore_points: true, ignore_lines: true, ..Default::default() };
-    let mut rest = text.as_bytes();
-    let loaded = tobj::load_obj_buf(&mut rest, &options, |name| {
-        let file = beside(path, "material file", &name.to_string_lossy()).map_err(fail)?;
-        read_materials(&file).map_err(fail)
-    });
-    let (models, materials) = loaded.map_err(|e| {
-        // Errors about the whole file name its last line.
-        let lines = text[..text.len() - rest.len()].lines().count();
-        wrong(format!("line {}: {e}", lines.max(1)))
-    })?;
-    if let Some(e) = failed.take() {
-        return Err(e);
-    }
-    check_whole(&text).map_err(wrong)?;
-    let materials = materials.unwrap_or_default();
-    // The parser ignores unknown names of materials.
-    let mut used = text.lines().filter_map(|line| line.strip_prefix("usemtl ")).map(str::trim);
-    let known = |name: &&str| materials.is_empty() || materials.iter().any(|m| m.name == **name);
-    if let Some(name) = used.find(|name| !known(name)) {
-        return Err(wrong(format!("its material `{}` is missing", quoted(name))));
-    }
-
+    read.check_whole(&text).map_err(wrong)?;
     let mut mesh = Mesh { materials: vec![Material::default()], ..Mesh::default() };
-    let mut textures = Textures::new();
-    for material in materials {
-        let texture = material.diffuse_texture.as_deref().map(|name| textures.beside(path, file_name(name)));
-        let color = match (&texture, material.diffuse) {
-            // Exporters leave the colour black or grey where a texture replaces it.
-            (Some(_), _) | (None, None) => Vec3::ONE,
-            (None, Some(color)) => Vec3::from_array(color).clamp(Vec3::ZERO, Vec3::ONE),
-        };
-        mesh.materials.push(Material { color, texture: texture.transpose()? });
-    }
-    for model in models {
-        let model = model.mesh;
-        let (first, first_texcoord) = (mesh.positions.len() as u32, mesh.texcoords.len() as u32);
-        mesh.positions.extend(model.positions.chunks_exact(3).map(Vec3::from_slice));
-        mesh.texcoords.extend(model.texcoords.chunks_exact(2).map(Vec2::from_slice));
-        let colors = model.vertex_color.chunks_exact(3).map(Vec3::from_slice);
-        add_colors(&mut mesh, first as usize, colors);
-        let material = model.material_id.map_or(0, |id| id as u32 + 1);
-        let mut texcoords = model.texcoord_indices.as_chunks::<3>().0.iter();
-        for rows in model.indices.as_chunks::<3>().0 {
-            mesh.faces.push(Face {
-                positions: rows.map(|row| row + first),
-                texcoords: texcoords.next().map(|rows| rows.map(|row| row + first_texcoord)),
-                material,
-            });
-        }
-    }
+    let known = read.materials(path, &mut mesh)?;
+    read.build(&known, &mut mesh).map_err(wrong)?;
     Ok(mesh)
 }
 
-/// Refuses a truncated file. Signs of truncation are:
-/// * a last line without a line break,
-/// * a face of fewer than three corners, which the parser takes for a line,
-/// * many vertices at the end that belong to no face,
-/// * a comment that counts more vertices or faces than the file contains.
-fn check_whole(text: &str) -> Result<(), String> {
-    let mut counts = Counts::default();
-    let mut last = 0_i64;
-    for (number, line) in text.lines().enumerate() {
-        counts.comment(line);
-        let mut words = line.split_ascii_whitespace().take_while(|word| !word.starts_with('#'));
-        match words.next() {
-            Some("v") => counts.vertices += 1,
-            Some(kind @ ("f" | "l" | "p")) => {
-                let mut corners = 0;
-                for word in words {
-                    corners += 1;
-                    let row: i64 = word.split('/').next().and_then(|row| row.parse().ok()).unwrap_or(0);
-                    // Negative indices count from the end.
-                    last = last.max(if row < 0 { counts.vertices + row + 1 } else { row });
-                }
-                if kind == "f" && corners < 3 {
-                    let line = quoted(line);
-                    return Err(format!("line {}, `{line}`: a face needs three corners", number + 1));
-                }
-                if kind == "f" {
-                    counts.faces += 1;
-                    counts.triangles += corners - 2;
-                }
+/// Line numbers and statements. A statement goes on after a line that ends with a backslash.
+fn statements(text: &str) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
+    let mut lines = (1..).zip(text.lines());
+    std::iter::from_fn(move || {
+        let (number, line) = lines.next()?;
+        let mut whole = Cow::Borrowed(line.trim());
+        while let Some(start) = whole.strip_suffix('\\').filter(|start| start.len() <= MAX_LINE) {
+            let next = lines.next().map_or("", |(_, line)| line.trim());
+            whole = Cow::Owned(format!("{start} {next}"));
+        }
+        Some((number, whole))
+    })
+}
+
+impl Statements<'_> {
+    fn add(&mut self, number: usize, line: &str) -> Result<(), String> {
+        if line.len() > MAX_LINE {
+            return Err(format!("longer than {MAX_LINE} bytes"));
+        }
+        self.counts.comment(line);
+        let (word, rest) = first_word(line);
+        // Names of files and materials may contain the sign of a comment.
+        let values = rest.split_once('#').map_or(rest, |(values, _)| values);
+        match word {
+            "v" => {
+                let values = numbers(values, 3).ok_or("no position")?;
+                self.positions.push(Vec3::from_slice(&values));
+                // After four or more numbers the fourth is a weight, and a seventh is the opacity.
+                self.colors.push((values.len() >= 6).then(|| Vec3::from_slice(&values[3..])));
+                self.counts.vertices += 1;
             }
+            "vt" => {
+                let values = numbers(values, 1).ok_or("no texture coordinates")?;
+                self.texcoords.push(Vec2::new(values[0], values.get(1).copied().unwrap_or(0.0)));
+            }
+            "f" | "l" | "p" => {
+                let corners = values.split_ascii_whitespace().map(|corner| self.corner(corner));
+                let corners = corners.collect::<Option<Vec<_>>>().ok_or("no face")?;
+                self.last = corners.iter().map(|(row, _)| row + 1).fold(self.last, usize::max);
+                if word != "f" {
+                    return Ok(());
+                }
+                if corners.len() < 3 {
+                    return Err("a face needs three corners".into());
+                }
+                self.counts.faces += 1;
+                self.counts.triangles += corners.len() as i64 - 2;
+                self.faces.push(Polygon { line: number, corners: corners.len(), material: self.used.len() });
+                self.corners.extend(corners);
+            }
+            "usemtl" => self.used.push((number, Cow::Owned(rest.to_owned()))),
+            "mtllib" => self.libraries.push(Cow::Owned(rest.to_owned())),
             _ => {}
         }
+        Ok(())
     }
-    // Old systems end a file with a control character.
-    let text = text.trim_end_matches(['\0', '\u{1a}']);
-    let end = text.lines().last().unwrap_or_default();
-    let is_statement = !end.trim().is_empty() && !end.trim_start().starts_with('#');
-    if counts.vertices > 0 && !text.ends_with('\n') && is_statement {
-        return Err(format!(
-            "its last line, `{}`, has no end: the file seems to be cut short (if it is whole, end it with a line break)",
-            quoted(end)
-        ));
+
+    /// Rows of the position and of the texture coordinate of a corner, as `7`, `7/3`, `7//2` or `7/3/2`. Negative
+    /// numbers count from the end.
+    fn corner(&self, text: &str) -> Option<(usize, Option<usize>)> {
+        let row = |text: &str, count: usize| match text.parse::<i64>().ok()? {
+            0 => None,
+            row if row < 0 => count.checked_sub(row.unsigned_abs() as usize),
+            row => Some(row as usize - 1),
+        };
+        let mut parts = text.split('/');
+        let position = row(parts.next()?, self.positions.len())?;
+        match parts.next().filter(|text| !text.is_empty()) {
+            Some(text) => Some((position, Some(row(text, self.texcoords.len())?))),
+            None => Some((position, None)),
+        }
     }
-    counts.check()?;
-    let (vertices, unused) = (counts.vertices, counts.vertices - last);
-    if last > 0 && unused > 2 && unused as f64 > UNUSED * vertices as f64 {
-        return Err(format!(
-            "its last {unused} of {vertices} vertices belong to no face: the file seems to be cut short"
-        ));
+
+    /// Reads the materials into `mesh`. Returns their names.
+    fn materials(&self, path: &Path, mesh: &mut Mesh) -> Result<Vec<String>, FileError> {
+        let mut files = Vec::new();
+        for names in &self.libraries {
+            // One name with spaces, or several names.
+            match beside(path, "material file", names) {
+                Ok(file) => files.push(file),
+                Err(e) if !names.contains(char::is_whitespace) => return Err(e),
+                Err(_) => {
+                    for name in names.split_whitespace() {
+                        files.push(beside(path, "material file", name)?);
+                    }
+                }
+            }
+        }
+        let (mut known, mut textures) = (Vec::new(), Textures::new());
+        for file in files {
+            for Described { name, color, texture } in read_materials(&file)? {
+                let texture = texture.map(|statement| textures.beside(path, file_name(&statement)));
+                // Exporters leave the colour black or grey where a texture replaces it.
+                let color = color.filter(|_| texture.is_none()).unwrap_or(Vec3::ONE);
+                let color = color.clamp(Vec3::ZERO, Vec3::ONE);
+                mesh.materials.push(Material { color, texture: texture.transpose()?, ..Material::default() });
+                known.push(name);
+            }
+        }
+        Ok(known)
     }
-    Ok(())
+
+    /// Makes triangles of the faces. `known` are the names of the mesh's materials after the first one.
+    fn build(&self, known: &[String], mesh: &mut Mesh) -> Result<(), String> {
+        let has_colors = self.colors.iter().any(Option::is_some);
+        let mut materials = vec![0];
+        for (line, name) in &self.used {
+            let row = known.iter().rposition(|other| other == name);
+            if row.is_none() && (!known.is_empty() || !has_colors) {
+                let name = quoted(name);
+                return Err(format!(
+                    "line {line}: its material `{name}` is missing: no `mtllib` file describes it"
+                ));
+            }
+            materials.push(row.map_or(0, |row| row as u32 + 1));
+        }
+        // Vertices without a face are left out: they are no part of the surface's size.
+        let mut rows = vec![u32::MAX; self.positions.len()];
+        let mut left = &self.corners[..];
+        for Polygon { line, corners, material } in &self.faces {
+            let (polygon, after) = left.split_at(*corners);
+            left = after;
+            let mut places = Vec::with_capacity(*corners);
+            for (position, texcoord) in polygon {
+                let missing = |what: &str, row: usize, count: usize| {
+                    format!("line {line}: a face refers to {what} {}, there are {count}", row + 1)
+                };
+                let place = self.positions.get(*position);
+                places.push(*place.ok_or_else(|| missing("vertex", *position, self.positions.len()))?);
+                if let Some(row) = texcoord.filter(|row| *row >= self.texcoords.len()) {
+                    return Err(missing("texture coordinate", row, self.texcoords.len()));
+                }
+                if rows[*position] == u32::MAX {
+                    rows[*position] = mesh.positions.len() as u32;
+                    mesh.positions.push(self.positions[*position]);
+                    if has_colors {
+                        mesh.colors.push(self.colors[*position].unwrap_or(Vec3::ONE));
+                    }
+                }
+            }
+            for triangle in triangles(&places) {
+                let texcoords = triangle.map(|i| polygon[i].1.map(|row| row as u32));
+                mesh.faces.push(Face {
+                    positions: triangle.map(|i| rows[polygon[i].0]),
+                    texcoords: if let [Some(a), Some(b), Some(c)] = texcoords {
+                        Some([a, b, c])
+                    } else {
+                        None
+                    },
+                    material: materials[*material],
+                });
+            }
+        }
+        mesh.texcoords.clone_from(&self.texcoords);
+        Ok(())
+    }
+
+    /// Refuses a truncated file. Signs of truncation are:
+    /// * a last line without a line break, unless comments count as many vertices and faces as there are,
+    /// * many vertices at the end that belong to no face,
+    /// * a comment that counts more vertices or faces than the file contains.
+    fn check_whole(&self, text: &str) -> Result<(), String> {
+        let are_all_there = self.counts.check()?;
+        // Old systems end a file with a control character.
+        let text = text.trim_end_matches(['\0', '\u{1a}']);
+        let end = text.lines().last().unwrap_or_default();
+        let is_statement = !end.trim().is_empty() && !end.trim_start().starts_with('#');
+        if !self.positions.is_empty() && !text.ends_with('\n') && is_statement && !are_all_there {
+            return Err(format!(
+                "its last line, `{}`, has no end: the file seems to be cut short (if it is whole, end it with a line break)",
+                quoted(end)
+            ));
+        }
+        let count = self.positions.len();
+        let unused = count.saturating_sub(self.last);
+        if self.last > 0 && unused > 2 && unused as f64 > UNUSED * count as f64 {
+            return Err(format!(
+                "its last {unused} of {count} vertices belong to no face: the file seems to be cut short"
+            ));
+        }
+        Ok(())
+    }
 }
 
 /// Numbers of an OBJ's statements, and the numbers that its comments promise.
@@ -174,8 +280,10 @@ impl Counts {
         }
     }
 
-    /// Refuses a comment that counts more than the file contains.
-    fn check(&self) -> Result<(), String> {
+    /// Refuses a comment that counts more than the file contains. Returns whether comments count exactly its vertices
+    /// and faces.
+    fn check(&self) -> Result<bool, String> {
+        let mut exact = [false; 2];
         for &(promised, noun) in &self.promised {
             let (found, most) = match noun {
                 "vertices" if self.has_points => continue,
@@ -188,9 +296,16 @@ impl Counts {
                     "a comment promises {promised} {noun}, there are {found}: the file seems to be cut short"
                 ));
             }
+            exact[usize::from(noun != "vertices")] |= promised == found || promised == most;
         }
-        Ok(())
+        Ok(exact == [true; 2])
     }
+}
+
+/// The numbers in a text; `None` for fewer than `least` or for another word.
+fn numbers(text: &str, least: usize) -> Option<Vec<f32>> {
+    let numbers: Option<Vec<f32>> = text.split_ascii_whitespace().map(|word| word.parse().ok()).collect();
+    numbers.filter(|numbers| numbers.len() >= least)
 }
 
 /// The file in a `map_Kd` statement, after its options (`-s 1 1 1 skin.png`).
@@ -223,28 +338,37 @@ fn read_lossy(path: &Path) -> Result<String, FileError> {
     Ok(String::from_utf8(bytes).unwrap_or_else(|e| String::from_utf8_lossy(e.as_bytes()).into_owned()))
 }
 
-/// Reads names, colours and textures of materials. The reader in `tobj` fails on damaged files.
-fn read_materials(path: &Path) -> Result<(Vec<tobj::Material>, HashMap<String, usize>), FileError> {
+/// A material of an MTL file.
+#[derive(Default)]
+struct Described {
+    name: String,
+    color: Option<Vec3>,
+    /// The text after `map_Kd`.
+    texture: Option<String>,
+}
+
+/// Reads names, colours and textures of materials.
+fn read_materials(path: &Path) -> Result<Vec<Described>, FileError> {
     let text = read_lossy(path)?;
-    let mut materials: Vec<tobj::Material> = Vec::new();
-    for (number, line) in text.lines().map(str::trim).enumerate() {
-        let (word, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
-        match (word, materials.last_mut()) {
-            ("newmtl", _) => {
-                materials.push(tobj::Material { name: rest.trim().to_owned(), ..Default::default() });
+    let mut materials: Vec<Described> = Vec::new();
+    for (number, line) in statements(&text) {
+        let (word, rest) = first_word(&line);
+        match (&*word.to_ascii_lowercase(), materials.last_mut()) {
+            ("newmtl", _) => materials.push(Described { name: rest.to_owned(), ..Described::default() }),
+            ("kd", Some(material)) => {
+                // One number is a grey.
+                let color = numbers(rest, 1).and_then(|values| match values[..] {
+                    [grey] => Some(Vec3::splat(grey)),
+                    [red, green, blue, ..] => Some(Vec3::new(red, green, blue)),
+                    _ => None,
+                });
+                let message = || format!("line {number}, `{}`: no colour", quoted(&line));
+                let color = color.filter(|color| color.is_finite());
+                material.color = Some(color.ok_or_else(|| FileError::unsuitable(path, message()))?);
             }
-            ("Kd", Some(material)) => {
-                let numbers: Vec<f32> = rest.split_whitespace().map_while(|n| n.parse().ok()).collect();
-                let color = numbers.try_into().ok().filter(|c: &[f32; 3]| c.iter().all(|v| v.is_finite()));
-                material.diffuse = Some(color.ok_or_else(|| {
-                    let message = format!("line {}, `{}`: no colour", number + 1, quoted(line));
-                    FileError::unsuitable(path, message)
-                })?);
-            }
-            ("map_Kd", Some(material)) => material.diffuse_texture = Some(rest.trim().to_owned()),
+            ("map_kd", Some(material)) => material.texture = Some(rest.to_owned()),
             _ => {}
         }
     }
-    let rows = materials.iter().enumerate().map(|(row, m)| (m.name.clone(), row)).collect();
-    Ok((materials, rows))
+    Ok(materials)
 }

@@ -8,7 +8,7 @@ use glam::{Vec2, Vec3};
 use snapsnap_base::{FileError, file, quoted};
 use snapsnap_splat::ply::header::{Element, Format, Scalar, parse};
 
-use super::{MAX_BYTES, Textures};
+use super::{MAX_BYTES, Textures, triangles};
 use crate::mesh::{Face, Material, Mesh};
 
 /// Most corners of a face; a longer list is a damaged file.
@@ -27,7 +27,15 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         ),
         format => Body::Binary { bytes: body, big: format == Format::BigEndian },
     };
-    let mut mesh = Mesh { materials: vec![Material::default()], ..Mesh::default() };
+    let mut mesh = Mesh::default();
+    let mut textures = Textures::new();
+    for name in header.comments.iter().filter_map(|comment| comment.strip_prefix("TextureFile")) {
+        let texture = Some(textures.beside(path, name.trim())?);
+        mesh.materials.push(Material { texture, ..Material::default() });
+    }
+    if mesh.materials.is_empty() {
+        mesh.materials.push(Material::default());
+    }
     for element in &header.elements {
         match element.name.as_str() {
             "vertex" => vertices(element, &mut body, &mut mesh),
@@ -42,9 +50,9 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         }
         .map_err(wrong)?;
     }
-    let named = header.comments.iter().find_map(|comment| comment.strip_prefix("TextureFile"));
-    if let Some(name) = named {
-        mesh.materials[0].texture = Some(Textures::new().beside(path, name.trim())?);
+    let is_textured = mesh.materials.iter().any(|material| material.texture.is_some());
+    if is_textured && mesh.faces.iter().any(|face| face.texcoords.is_none()) {
+        return Err(wrong("it has a texture, and a face without texture coordinates".into()));
     }
     Ok(mesh)
 }
@@ -162,16 +170,22 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), Stri
         return Err("`face` has no list `vertex_indices`".into());
     }
     let per_vertex = !mesh.texcoords.is_empty();
+    let is_number = |name: &str| matches!(name, "texnumber" | "texture_number");
+    if mesh.materials.len() > 1 && !element.properties.iter().any(|p| is_number(&p.name)) {
+        return Err(format!("it has {} textures, and `face` has no `texnumber`", mesh.materials.len()));
+    }
     let (mut corners, mut texcoords) = (Vec::new(), Vec::new());
     for row in 0..element.count {
         corners.clear();
         texcoords.clear();
+        let mut material = 0;
         read_row(element, row, MAX_CORNERS, body, |body, column| {
             let property = &element.properties[column];
             match property.name.as_str() {
                 "vertex_indices" | "vertex_index" => {
                     corners.push(u32::try_from(body.count(property.kind)?).ok()?);
                 }
+                name if is_number(name) => material = u32::try_from(body.count(property.kind)?).ok()?,
                 "texcoord" => texcoords.push(body.number(property.kind)?),
                 _ => drop(body.number(property.kind)?),
             }
@@ -182,15 +196,16 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), Stri
         if per_corner {
             mesh.texcoords.extend(texcoords.chunks_exact(2).map(Vec2::from_slice));
         }
-        // A fan of triangles. Fewer than three corners give none.
-        for i in 1..corners.len().saturating_sub(1) {
-            let positions = [corners[0], corners[i], corners[i + 1]];
-            let texcoords = if per_vertex {
-                Some(positions)
-            } else {
-                per_corner.then(|| [first, first + i as u32, first + i as u32 + 1])
-            };
-            mesh.faces.push(Face { positions, texcoords, material: 0 });
+        let place = |row: &u32| mesh.positions.get(*row as usize).copied();
+        let Some(places) = corners.iter().map(place).collect::<Option<Vec<_>>>() else {
+            let count = mesh.positions.len();
+            return Err(format!("face {row} refers to a vertex above {count}, the number of vertices"));
+        };
+        for triangle in triangles(&places) {
+            let positions = triangle.map(|i| corners[i]);
+            let own = per_corner.then(|| triangle.map(|i| first + i as u32));
+            let texcoords = if per_vertex { Some(positions) } else { own };
+            mesh.faces.push(Face { positions, texcoords, material });
         }
     }
     Ok(())

@@ -5,8 +5,11 @@ use std::path::{Path, PathBuf};
 use glam::{Vec2, Vec3};
 use image::{ImageFormat, Rgb, RgbImage};
 
-use super::read;
+use super::{read, triangles};
 use crate::mesh::Mesh;
+use crate::view::{Renderer, ViewOptions};
+
+mod odd;
 
 /// A picture with one pixel of each of four colours, as PNG.
 fn png() -> Vec<u8> {
@@ -211,9 +214,9 @@ fn corrupt_scans_are_refused_by_name() {
         glb(|json| json.replace(r#""images":[{"bufferView":3,"mimeType":"image/png"}]"#, &image))
     };
     let table: Vec<(&str, Vec<u8>, &str)> = vec![
-        ("truncated.obj", b"v 0 0 0\nv 1 0 0\nv 0 1".into(), "line 3: position parse error"),
+        ("truncated.obj", b"v 0 0 0\nv 1 0 0\nv 0 1".into(), "line 3, `v 0 1`: no position"),
         ("huge.obj", triangle.replace("1 0 0", "1 1e39 0").into(), "position 1 is not finite"),
-        ("range.obj", triangle.replace("f 1 2 3", "f 1 2 9").into(), "face vertex index out of bounds"),
+        ("range.obj", triangle.replace("f 1 2 3", "f 1 2 9").into(), "line 4: a face refers to vertex 9, there are 3"),
         ("line.obj", vec![b'v'; 5 << 20], "line 1: longer than 1048576 bytes"),
         ("bytes.obj", vec![0xff; 1000], "there is no triangle"),
         ("unknown.obj", format!("mtllib known.mtl\nusemtl zzz\n{triangle}").into(), "material `zzz` is missing"),

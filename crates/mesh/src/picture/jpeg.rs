@@ -8,6 +8,8 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
+use super::orientation;
+
 /// Largest number of pixels per byte of a JPEG: each 8×8 block takes at least one bit.
 const MAX_PIXELS_PER_BYTE: u64 = 512;
 
@@ -18,6 +20,9 @@ pub struct Jpeg<'a> {
     pub size: [u32; 2],
     is_grey: bool,
 }
+
+/// A picture as it is stored, its orientation, and its ICC profile.
+type Decoded = (DynamicImage, Option<Orientation>, Option<Vec<u8>>);
 
 fn damaged(message: impl ToString) -> ImageError {
     let message = message.to_string();
@@ -44,11 +49,10 @@ impl<'a> Jpeg<'a> {
         Ok(Self { decoder, size: [width as u32, height as u32], is_grey })
     }
 
-    /// The picture as it is stored, its orientation, and its ICC profile.
-    pub fn decode(mut self) -> Result<(DynamicImage, Orientation, Option<Vec<u8>>), ImageError> {
+    /// Decodes the picture.
+    pub fn decode(mut self) -> Result<Decoded, ImageError> {
         let pixels = self.decoder.decode().map_err(|e| damaged(format!("{e:?}")))?;
-        let exif = self.decoder.exif();
-        let orientation = exif.and_then(|exif| Orientation::from_exif_chunk(exif));
+        let orientation = self.decoder.exif().cloned().and_then(orientation);
         let [width, height] = self.size;
         let picture = if self.is_grey {
             GrayImage::from_raw(width, height, pixels).map(DynamicImage::ImageLuma8)
@@ -56,8 +60,26 @@ impl<'a> Jpeg<'a> {
             RgbImage::from_raw(width, height, pixels).map(DynamicImage::ImageRgb8)
         };
         let picture = picture.ok_or_else(|| damaged("it contains fewer pixels than its header promises"))?;
-        Ok((picture, orientation.unwrap_or(Orientation::NoTransforms), self.decoder.icc_profile()))
+        Ok((picture, orientation, self.decoder.icc_profile()))
     }
+}
+
+/// A JPEG without stray bytes between the segments of its header.
+pub fn tidied(mut bytes: Vec<u8>) -> Vec<u8> {
+    let mut at = 2;
+    // The coded data begin with the segment 0xDA.
+    while let Some([first, marker, high, low]) = bytes.get(at..at + 4).and_then(|start| start.first_chunk()) {
+        match (first, marker) {
+            (0xff, 0xff) => at += 1,
+            (0xff, 0xda | 0) => break,
+            (0xff, _) => at += 2 + usize::from(u16::from_be_bytes([*high, *low])),
+            _ => {
+                let next = bytes[at..].iter().position(|byte| *byte == 0xff).unwrap_or(bytes.len() - at);
+                bytes.drain(at..at + next);
+            }
+        }
+    }
+    bytes
 }
 
 /// Whether the segments of a JPEG lead to an end-of-image marker (ITU T.81, B.1.1). Thumbnails inside segments do not

@@ -59,6 +59,30 @@ fn jpegs_are_decoded_as_by_the_image_crate() {
     }
 }
 
+/// A JPEG with EXIF data that tell of a turn by 90° in a number of this type, after `stray` bytes.
+fn turned(kind: u16, stray: &[u8]) -> Vec<u8> {
+    let mut exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01".to_vec();
+    exif.extend([&kind.to_le_bytes()[..], &[1, 0, 0, 0, 6, 0, 0, 0], &[0; 4]].concat());
+    let jpeg = encoded(ImageFormat::Jpeg);
+    let length = (exif.len() as u16 + 2).to_be_bytes();
+    [&jpeg[..2], b"\xff\xe1", &length, &exif, stray, &jpeg[2..]].concat()
+}
+
+#[test]
+fn orientations_of_every_type_count_and_stray_bytes_between_segments_do_not() {
+    let size = |bytes: Vec<u8>| {
+        let picture = decode_bytes(Path::new("a.jpg"), &bytes, MAX_BYTES).expect("decodes");
+        [picture.width(), picture.height()]
+    };
+    assert_eq!(size(encoded(ImageFormat::Jpeg)), [120, 90]);
+    // Bytes, shorts and longs; texts are no numbers.
+    for (kind, expected) in [(1, [90, 120]), (3, [90, 120]), (4, [90, 120]), (2, [120, 90])] {
+        for stray in [&b""[..], b"\0", b"\0\x01\xff\xff\xff"] {
+            assert_eq!(size(turned(kind, stray)), expected, "{kind} {stray:?}");
+        }
+    }
+}
+
 #[test]
 fn sizes_are_checked_before_pixels_are_decoded() {
     let error = |bytes: &[u8], most| {

@@ -114,17 +114,30 @@ impl Shader<'_> {
             color *= mix(face.positions.map(|row| mesh.colors[row as usize]));
         }
         if let Some((texture, rows)) = textures[face.material as usize].as_ref().zip(face.texcoords) {
-            let coordinates = rows.map(|row| mesh.texcoords[row as usize].as_dvec2());
-            let coordinate = |at: DVec2| {
-                let w = self.weights(face.positions, at, plane);
-                coordinates[0] * w.x + coordinates[1] * w.y + coordinates[2] * w.z
-            };
+            let coordinate = |at: DVec2| self.texcoord(face.positions, rows, at, plane);
             let here = coordinate(at);
             // Change per pixel, from a small step, since the step of a whole pixel may lead beyond the horizon.
             let change = |way: DVec2| ((coordinate(at + STEP * way) - here) / STEP).as_vec2();
             color *= texture.sample(here.as_vec2(), change(DVec2::X), change(DVec2::Y));
         }
         color
+    }
+
+    /// Whether the surface of `face` is cut out at pixel coordinates `at`.
+    pub fn is_cut(&self, face: usize, at: DVec2, plane: DVec3) -> bool {
+        let face = &self.renderer.mesh.faces[face];
+        self.renderer.holes(face).is_some_and(|(opacity, rows)| {
+            let at = self.texcoord(face.positions, rows, at, plane);
+            let texel = |at: f64, side: u32| ((at.rem_euclid(1.0) * f64::from(side)) as u32).min(side - 1);
+            opacity.get_pixel(texel(at.x, opacity.width()), texel(1.0 - at.y, opacity.height()))[0] == 0
+        })
+    }
+
+    /// Texture coordinates at pixel coordinates `at`; `positions` and `rows` are the face's positions and coordinates.
+    fn texcoord(&self, positions: [u32; 3], rows: [u32; 3], at: DVec2, plane: DVec3) -> DVec2 {
+        let w = self.weights(positions, at, plane).to_array();
+        let corners = rows.map(|row| self.renderer.mesh.texcoords[row as usize].as_dvec2());
+        corners.into_iter().zip(w).map(|(corner, w)| corner * w).sum()
     }
 
     /// Barycentric weights of the point on the triangle's plane at pixel coordinates `at`.

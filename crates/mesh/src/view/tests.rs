@@ -226,7 +226,7 @@ fn a_textured_cube_shows_its_picture_undistorted() {
     }
     // Smooth: red grows to the right, green upwards.
     let texture = RgbImage::from_fn(256, 256, |x, y| Rgb([x as u8, 255 - y as u8, 128]));
-    let material = Material { color: Vec3::ONE, texture: Some(Arc::new(texture)) };
+    let material = Material { texture: Some(Arc::new(texture)), ..Material::default() };
     let cube = Mesh { positions, texcoords, faces, materials: vec![material], ..Mesh::default() };
     let mut camera = camera(120, 120);
     let rotation = DMat3::from_rotation_x(0.6) * DMat3::from_rotation_y(0.7);
@@ -272,7 +272,7 @@ fn distant_textures_are_averaged() {
         positions: corners.map(|(x, y)| Vec3::new(x, y, 4.0)).to_vec(),
         texcoords: corners.map(|(x, y)| Vec2::new(0.5 + 0.5 * x, 0.5 - 0.5 * y)).to_vec(),
         faces: rows.map(|rows| Face { positions: rows, texcoords: Some(rows), material: 0 }).to_vec(),
-        materials: vec![Material { color: Vec3::ONE, texture: Some(Arc::new(texture)) }],
+        materials: vec![Material { texture: Some(Arc::new(texture)), ..Material::default() }],
         ..Mesh::default()
     };
     let view = draw(&plane, &camera(40, 40), &flat(1));
@@ -299,7 +299,7 @@ fn light_is_never_clipped_and_the_nearer_surface_is_visible_from_both_sides() {
     let mut both = triangle(2.0);
     both.positions.extend(triangle(3.0).positions);
     both.faces.push(Face { positions: [3, 5, 4], texcoords: None, material: 1 });
-    both.materials.push(Material { color: Vec3::X, texture: None });
+    both.materials.push(Material { color: Vec3::X, ..Material::default() });
     let view = draw(&both, &camera(32, 32), &flat(2));
     let middle = 17 * 32 + 15;
     assert_eq!((view.color[middle], view.depth[middle]), ([1.0; 3], 2.0));

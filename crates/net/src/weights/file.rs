@@ -85,9 +85,13 @@ pub fn write_tensors(
         let mut written = 0;
         let mut problems = Vec::new();
         for (i, name) in names.iter().enumerate() {
-            let bytes = float.bytes(&values(i).map_err(io::Error::other)?);
-            // Values beyond the range of 16 bits are infinite now.
-            problems.extend(not_finite(name, &float.widened(&bytes)));
+            let values = values(i).map_err(io::Error::other)?;
+            let bytes = float.bytes(&values);
+            // Finite values beyond the range of 16 bits are infinite now.
+            let beyond = || {
+                Some(format!("beyond the range of 16 bits, {}", not_finite(name, &float.widened(&bytes))?))
+            };
+            problems.extend(not_finite(name, &values).or_else(beyond));
             out.write_all(&bytes)?;
             written += bytes.len();
             progress(written as u64, at as u64);

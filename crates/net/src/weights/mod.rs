@@ -21,15 +21,26 @@ pub use init::{SideHeads, init};
 pub use load::{random_predictor, random_regressors};
 pub use source::{Entry, Source};
 
-/// The first problems, a line each, and the number of the others.
+/// A line for each kind of problem, with its first tensors and the number of the others.
 fn listed(problems: &[String]) -> String {
-    /// Lines that are shown.
-    const SHOWN: usize = 12;
-    let shown = problems[..problems.len().min(SHOWN)].join("\n  ");
-    match problems.len().saturating_sub(SHOWN) {
-        0 => shown,
-        more => format!("{shown}\n  … and {more} more"),
+    /// Tensors that are shown.
+    const SHOWN: usize = 3;
+    let mut kinds: Vec<(&str, Vec<&str>)> = Vec::new();
+    for problem in problems {
+        let (kind, tensor) = problem.split_once(": ").unwrap_or(("", problem));
+        match kinds.iter_mut().find(|(other, _)| *other == kind) {
+            Some((_, tensors)) => tensors.push(tensor),
+            None => kinds.push((kind, vec![tensor])),
+        }
     }
+    let line = |(kind, tensors): &(&str, Vec<&str>)| {
+        let shown = tensors[..tensors.len().min(SHOWN)].join("; ");
+        match tensors.len().saturating_sub(SHOWN) {
+            0 => format!("{kind}: {shown}"),
+            more => format!("{kind}: {shown}; and {more} more"),
+        }
+    };
+    kinds.iter().map(line).collect::<Vec<_>>().join("\n  ")
 }
 
 /// Errors of weight files.
@@ -38,7 +49,8 @@ pub enum WeightsError {
     /// The file could not be read or written, or is unsuitable.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Tensors are missing, unused, mis-shaped, of the wrong type, not finite or given twice.
+    /// Tensors are missing, unused, mis-shaped, of the wrong type, not finite or given twice. A problem is its kind, a
+    /// colon and the tensor.
     #[error("{origin}: {} problem(s) with the weights:\n  {}", .problems.len(), listed(.problems))]
     Tensors {
         /// File or files.

@@ -6,7 +6,7 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use burn::tensor::{bf16, f16};
-use pytorch_reader::PytorchReader;
+use pytorch_reader::{PickleError, PytorchError, PytorchReader};
 use rayon::prelude::*;
 use safetensors::Dtype;
 use safetensors::tensor::Metadata;
@@ -114,7 +114,7 @@ impl Source {
         });
         Ok(Self {
             path: path.to_owned(),
-            tensors: tensors.collect(),
+            tensors: unwrapped(tensors.collect()),
             reader,
             metadata: metadata.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect(),
         })
@@ -123,15 +123,18 @@ impl Source {
     fn pytorch(path: &Path) -> Result<Self, WeightsError> {
         let all = PytorchReader::new(path)
             .map_err(|e| {
-                FileError::unsuitable(path, format!("neither safetensors nor a PyTorch checkpoint: {e}"))
+                let message = match &e {
+                    PytorchError::Pickle(PickleError::UnexpectedOpCode(_)) => {
+                        "holds a `defaultdict`, a `deque` or the like beside its weights, which is not read: load it in \
+                         PyTorch and save the weights alone"
+                            .into()
+                    }
+                    e => format!("neither safetensors nor a PyTorch checkpoint: {e}"),
+                };
+                FileError::unsuitable(path, message)
             })?
             .into_tensors();
-        // The weights of Snap-Snap are below `network`, the weights of DUSt3R and CroCo below `model`, beside
-        // optimiser states.
-        let wrapper =
-            ["network.", "model."].into_iter().find(|w| all.keys().any(|k| k.starts_with(w))).unwrap_or("");
-        let reader: BTreeMap<_, _> =
-            all.into_iter().filter_map(|(k, t)| Some((k.strip_prefix(wrapper)?.to_owned(), t))).collect();
+        let reader = unwrapped(all.into_iter().collect());
         let entry = |t: &pytorch_reader::Tensor| Entry {
             dtype: format!("{:?}", t.dtype()).to_lowercase(),
             shape: t.shape().to_vec(),
@@ -191,6 +194,20 @@ impl Source {
         };
         Ok(values.map_err(FileError::read(&self.path))?)
     }
+}
+
+/// Tensors by their names in the networks. The weights of Snap-Snap are below `network`, the weights of DUSt3R and CroCo
+/// below `model`, beside optimiser states. PyTorch's wrappers of networks add parts to the names.
+fn unwrapped<T>(mut tensors: BTreeMap<String, T>) -> BTreeMap<String, T> {
+    const WRAPPERS: [&str; 4] = ["network.", "model.", "state_dict.", "model_state_dict."];
+    while let Some(wrapper) = WRAPPERS.into_iter().find(|w| tensors.keys().any(|key| key.starts_with(w))) {
+        let inner =
+            tensors.into_iter().filter_map(|(key, t)| Some((key.strip_prefix(wrapper)?.to_owned(), t)));
+        tensors = inner.collect();
+    }
+    let is_name = |part: &&str| !matches!(*part, "module" | "_orig_mod");
+    let bare = |key: &str| key.split('.').filter(is_name).collect::<Vec<_>>().join(".");
+    tensors.into_iter().map(|(key, tensor)| (bare(&key), tensor)).collect()
 }
 
 /// Numbers in files. f32 holds all of them without loss.

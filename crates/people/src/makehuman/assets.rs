@@ -146,7 +146,7 @@ impl Fitted {
 
 fn material(cloth: &Cloth, size: f32) -> Material {
     if let Cloth::Plain(color) = cloth {
-        return Material { color: *color, texture: None };
+        return Material { color: *color, ..Material::default() };
     }
     let mut texture = RgbImage::new(TEXTURE, TEXTURE);
     let row = 3 * TEXTURE as usize;
@@ -156,5 +156,5 @@ fn material(cloth: &Cloth, size: f32) -> Material {
             pixel.copy_from_slice(&bytes(cloth.color(at, size)));
         }
     });
-    Material { color: Vec3::ONE, texture: Some(Arc::new(texture)) }
+    Material { texture: Some(Arc::new(texture)), ..Material::default() }
 }

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::f32::consts::PI;
 use std::sync::Arc;
 
-use glam::{Vec2, Vec3};
+use glam::Vec2;
 use image::RgbImage;
 use rayon::prelude::*;
 
@@ -80,7 +80,7 @@ pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
     let texture = RgbImage::from_raw(size[0] as u32, size[1] as u32, picture).expect("three bytes per texel");
 
     let mut mesh = Mesh {
-        materials: vec![Material { color: Vec3::ONE, texture: Some(Arc::new(texture)) }],
+        materials: vec![Material { texture: Some(Arc::new(texture)), ..Material::default() }],
         ..Mesh::default()
     };
     let mut rows = HashMap::new();

@@ -9,7 +9,7 @@ use snapsnap_net::config::Config;
 use snapsnap_net::network::View;
 use snapsnap_net::painter::{Painted, Painter};
 use snapsnap_net::steps::Record;
-use snapsnap_net::{Points, Prediction, placed};
+use snapsnap_net::{Points, Prediction, backing, placed};
 use snapsnap_ops::mean;
 use snapsnap_splat::Gaussians;
 
@@ -55,6 +55,8 @@ pub(super) fn gaussians(
     phase: &Phase,
     device: &Device,
 ) -> Option<Gaussians> {
+    // As in use.
+    let has_backing = !config.mode.compat && prediction.maps.len() > 2;
     let mut points = Points::new(prediction.pasted(&config.network));
     let painter = Painter {
         config,
@@ -63,9 +65,14 @@ pub(super) fn gaussians(
         views: phase.views.clone(),
         side_colors: true,
     };
-    let Painted { gaussians, origins, .. } = painter.gaussians(&mut points, device, &mut Record::default());
+    let Painted { mut gaussians, mut origins, .. } =
+        painter.gaussians(&mut points, device, &mut Record::default());
     if gaussians.is_empty() {
         return None;
+    }
+    if has_backing && let Some((backing, more)) = backing(&gaussians, &origins, config) {
+        gaussians = Gaussians::joined(&[gaussians, backing]);
+        origins.extend(more);
     }
     let to_world = item.cameras[View::Front as usize].world_to_camera.inverse();
     let person = match &item.restoration {

@@ -1,4 +1,4 @@
-//! `snapsnap prepare`: renders data sets of scanned or generated people, checks and packs data sets.
+//! `snapsnap prepare`: renders data sets of scanned or generated people, checks data sets.
 
 mod generate;
 mod preview;
@@ -20,7 +20,7 @@ use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::Mesh;
 
 use crate::failure::{Failure, bail};
-use crate::output::{check_outputs, is_same_file, outside_data};
+use crate::output::{check_folder, check_outputs, is_same_file, outside_data};
 use crate::progress::Progress;
 use crate::{output, say};
 
@@ -58,9 +58,6 @@ enum Kind {
     /// List the faults of a data set.
     #[command(after_help = "Example: snapsnap prepare check people/synth")]
     Check(CheckArguments),
-    /// Pack a data set into tar archives, which a training reads without unpacking them.
-    #[command(after_help = "Example: snapsnap prepare pack people/synth -o packed/synth")]
-    Pack(PackArguments),
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
@@ -70,7 +67,6 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         Kind::Makehuman(arguments) => generate::makehuman(arguments),
         Kind::Avatars(arguments) => generate::avatars(arguments),
         Kind::Check(arguments) => check(arguments),
-        Kind::Pack(arguments) => pack(arguments),
     }
 }
 
@@ -92,38 +88,6 @@ fn check(arguments: &CheckArguments) -> Result<(), Failure> {
         return Err(Failure::Input(format!("{looked}: {} faults", checked.problems.len())));
     }
     say::info(&format!("{looked}: no fault"));
-    Ok(())
-}
-
-#[derive(Args)]
-struct PackArguments {
-    /// Folder of the data set.
-    dataset: PathBuf,
-    /// New folder for the archives. It can be used wherever a data set is asked for.
-    #[arg(short, long, value_name = "DIR")]
-    output: PathBuf,
-    /// Megabytes of an archive, about. Subjects are not divided.
-    #[arg(long, value_name = "MB", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
-    archive_size: u64,
-}
-
-fn pack(arguments: &PackArguments) -> Result<(), Failure> {
-    let folder = Folder::open(&arguments.dataset)?;
-    outside_data(&arguments.output, [arguments.dataset.as_path()])?;
-    let progress = Progress::steps(0, "subjects");
-    let size = 1_000_000 * arguments.archive_size;
-    let packed = dataset::pack(&folder, &arguments.output, size, |done, all| {
-        progress.step(done, all, "subjects");
-    })?;
-    drop(progress);
-    let megabytes = packed.bytes as f64 / 1e6;
-    say::info(&format!(
-        "{}: {} subjects, {} files in {} archives of {megabytes:.1} MB together",
-        arguments.output.display(),
-        packed.subjects,
-        packed.files,
-        packed.archives
-    ));
     Ok(())
 }
 
@@ -173,7 +137,12 @@ fn check_preview(sheet: &Path, common: &Common, inputs: &[&Path]) -> Result<(), 
     if !sheet.extension().is_some_and(|e| e.eq_ignore_ascii_case("png")) {
         bail!("--preview {}: must end in .png", sheet.display());
     }
-    check_outputs(&[sheet], &[])?;
+    let within = file::folder_of(sheet);
+    if within.exists() {
+        check_outputs(&[sheet], &[])?;
+    } else {
+        check_folder(within)?;
+    }
     outside_data(sheet, inputs.iter().copied().chain([common.output.as_path()]))
 }
 
@@ -268,7 +237,8 @@ fn make(
         return Ok(());
     }
     let all = missing.len();
-    Err(Failure::Input(format!("{failed} of {all} subjects could not be made; the others are there")))
+    let others = if failed < all { "; the others are there" } else { "" };
+    Err(Failure::Input(format!("{failed} of {all} subjects could not be made{others}")))
 }
 
 /// Normalises the mesh for the cameras. Training subjects get a random offset, seeded by their names.

@@ -3,10 +3,12 @@
 use std::path::Path;
 
 use image::{RgbImage, imageops};
+use snapsnap_base::file;
 use snapsnap_data::dataset::Folder;
 
 use super::Work;
 use crate::failure::Failure;
+use crate::output::make_folder;
 use crate::pictures::{sheet, write_png};
 
 /// Side of a subject's picture in pixels.
@@ -29,6 +31,7 @@ pub fn write(path: &Path, folder: &Folder, subjects: &[&Work]) -> Result<(), Fai
             pictures.push(shrink(&color, &mask));
         }
     }
+    make_folder(file::folder_of(path))?;
     let columns = pictures.len().min(COLUMNS);
     let empty = RgbImage::from_pixel(SIDE, SIDE, image::Rgb(BACKGROUND));
     pictures.resize(pictures.len().next_multiple_of(columns), empty);
