@@ -322,10 +322,12 @@ mod tests {
     }
 
     /// Dictionaries of NumPy arrays from Python's `pickle`, with `global_orient` = [[0.25, −1.5, 0.125]].
-    const PICKLES: [&[u8]; 3] = [
+    const PICKLES: [&[u8]; 4] = [
         include_bytes!("../tests/smplx/protocol2.pkl"),
         include_bytes!("../tests/smplx/protocol4.pkl"),
         include_bytes!("../tests/smplx/big_endian.pkl"),
+        // Protocol 5 of NumPy 2.
+        include_bytes!("../tests/smplx/numpy2.pkl"),
     ];
 
     #[test]

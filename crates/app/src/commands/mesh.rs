@@ -103,6 +103,7 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
     let mut target = Target::new(&arguments.output, &arguments.surface)?;
     target.options.force = arguments.force;
     check_outputs(&target.files(), &[&arguments.input])?;
+    target.check_companions()?;
     let loaded = read(&arguments.input)?.load(device);
     check_size(&loaded, device).map_err(|e| e.about(&arguments.input))?;
     let fused = target.write(&loaded, &arguments.input)?;
@@ -156,12 +157,6 @@ impl Target {
         let bytes = TEXEL * (texture as u64).pow(2);
         memory::check(&format!("--texture {texture}"), bytes, "choose a smaller one")?;
         let companions = export::companions(path, texture > 0);
-        if let Some(other) = companions.iter().find(|other| !path.exists() && other.exists()) {
-            return Err(Failure::file(
-                other,
-                "would be replaced, but belongs to no mesh of this name: move it away",
-            ));
-        }
         let options = Options { faces: surface.faces.unwrap_or(defaults.faces), texture, ..defaults };
         Ok(Self { path: path.to_owned(), companions, options })
     }
@@ -169,6 +164,17 @@ impl Target {
     pub fn files(&self) -> Vec<&Path> {
         let companions = self.companions.iter().map(PathBuf::as_path);
         companions.chain([self.path.as_path()]).collect()
+    }
+
+    /// Refuses companions of a new mesh that are there already.
+    pub fn check_companions(&self) -> Result<(), Failure> {
+        match self.companions.iter().find(|other| !self.path.exists() && other.exists()) {
+            None => Ok(()),
+            Some(other) => Err(Failure::file(
+                other,
+                "would be replaced, but belongs to no mesh of this name: move it away",
+            )),
+        }
     }
 
     /// Makes the mesh of Gaussians and writes it. Errors contain `name`, the Gaussians' file.

@@ -169,6 +169,7 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let saved = arguments.save_cutouts.as_deref().map(cutout_paths).transpose()?;
     let config_path =
         check_paths(arguments, paths, output, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
+    target.iter().try_for_each(Target::check_companions)?;
     paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
     let masks = arguments.masks.as_deref().unwrap_or_default();
     let since = Instant::now();

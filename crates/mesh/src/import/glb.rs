@@ -93,7 +93,8 @@ pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
         (Cow::from(&*bytes), Vec::new())
     };
     // Some exporters pad the text with zeros.
-    let json = &json[..json.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1)];
+    let is_text = |byte: &u8| *byte != 0 && !byte.is_ascii_whitespace();
+    let json = &json[..json.iter().rposition(is_text).map_or(0, |last| last + 1)];
     let mut root: Root = gltf::json::deserialize::from_slice(json).map_err(|e| invalid(&e))?;
     drop(bytes);
     check_references(&root).map_err(|e| invalid(&e))?;

@@ -36,10 +36,11 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     if mesh.materials.is_empty() {
         mesh.materials.push(Material::default());
     }
+    let mut polygons = Polygons::default();
     for element in &header.elements {
         match element.name.as_str() {
             "vertex" => vertices(element, &mut body, &mut mesh),
-            "face" => faces(element, &mut body, &mut mesh),
+            "face" => faces(element, &mut body, &mut mesh, &mut polygons),
             // Elements without properties have no bytes in the file.
             _ if element.properties.is_empty() => Ok(()),
             _ => (0..element.count).try_for_each(|row| {
@@ -50,11 +51,44 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         }
         .map_err(wrong)?;
     }
+    polygons.build(&mut mesh).map_err(wrong)?;
     let is_textured = mesh.materials.iter().any(|material| material.texture.is_some());
     if is_textured && mesh.faces.iter().any(|face| face.texcoords.is_none()) {
         return Err(wrong("it has a texture, and a face without texture coordinates".into()));
     }
     Ok(mesh)
+}
+
+/// Faces of any number of corners. Their vertices may come later.
+#[derive(Default)]
+struct Polygons {
+    /// Vertices of all faces.
+    corners: Vec<u32>,
+    /// By face: number of corners, row of the first corner's texture coordinate if each corner has its own, material.
+    faces: Vec<(usize, Option<u32>, u32)>,
+    /// Whether vertices have texture coordinates.
+    per_vertex: bool,
+}
+
+impl Polygons {
+    fn build(&self, mesh: &mut Mesh) -> Result<(), String> {
+        let mut left = &self.corners[..];
+        for (face, (count, first, material)) in self.faces.iter().enumerate() {
+            let (corners, after) = left.split_at(*count);
+            left = after;
+            let place = |row: &u32| mesh.positions.get(*row as usize).copied().ok_or(*row);
+            let places = corners.iter().map(place).collect::<Result<Vec<_>, _>>().map_err(|row| {
+                format!("face {face} refers to position {row}, there are {}", mesh.positions.len())
+            })?;
+            for triangle in triangles(&places) {
+                let positions = triangle.map(|i| corners[i]);
+                let own = first.map(|first| triangle.map(|i| first + i as u32));
+                let texcoords = if self.per_vertex { Some(positions) } else { own };
+                mesh.faces.push(Face { positions, texcoords, material: *material });
+            }
+        }
+        Ok(())
+    }
 }
 
 /// The values after the header.
@@ -164,12 +198,12 @@ fn vertices(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), S
     Ok(())
 }
 
-fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), String> {
+fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh, polygons: &mut Polygons) -> Result<(), String> {
     let is_corners = |name: &str| matches!(name, "vertex_indices" | "vertex_index");
     if !element.properties.iter().any(|p| p.list.is_some() && is_corners(&p.name)) {
         return Err("`face` has no list `vertex_indices`".into());
     }
-    let per_vertex = !mesh.texcoords.is_empty();
+    polygons.per_vertex = !mesh.texcoords.is_empty();
     let is_number = |name: &str| matches!(name, "texnumber" | "texture_number");
     if mesh.materials.len() > 1 && !element.properties.iter().any(|p| is_number(&p.name)) {
         return Err(format!("it has {} textures, and `face` has no `texnumber`", mesh.materials.len()));
@@ -192,21 +226,12 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), Stri
             Some(())
         })?;
         let first = mesh.texcoords.len() as u32;
-        let per_corner = !per_vertex && !corners.is_empty() && texcoords.len() == 2 * corners.len();
+        let per_corner = !polygons.per_vertex && !corners.is_empty() && texcoords.len() == 2 * corners.len();
         if per_corner {
             mesh.texcoords.extend(texcoords.chunks_exact(2).map(Vec2::from_slice));
         }
-        let place = |row: &u32| mesh.positions.get(*row as usize).copied();
-        let Some(places) = corners.iter().map(place).collect::<Option<Vec<_>>>() else {
-            let count = mesh.positions.len();
-            return Err(format!("face {row} refers to a vertex above {count}, the number of vertices"));
-        };
-        for triangle in triangles(&places) {
-            let positions = triangle.map(|i| corners[i]);
-            let own = per_corner.then(|| triangle.map(|i| first + i as u32));
-            let texcoords = if per_vertex { Some(positions) } else { own };
-            mesh.faces.push(Face { positions, texcoords, material });
-        }
+        polygons.corners.extend(&corners);
+        polygons.faces.push((corners.len(), per_corner.then_some(first), material));
     }
     Ok(())
 }

@@ -97,7 +97,7 @@ fn plys_with_several_textures_name_them_by_face() {
         (text("", [face, face]), "has 2 textures, and `face` has no `texnumber`"),
         (text(number, [&format!("{face} 2"), &rows[1]]), "refers to material 2, there are 2"),
         (text(number, ["3 0 1 2 0 0", &rows[1]]), "a face without texture coordinates"),
-        (text(number, ["3 0 1 9 6 0 0 1 0 0 1 0", &rows[1]]), "a vertex above 3"),
+        (text(number, ["3 0 1 9 6 0 0 1 0 0 1 0", &rows[1]]), "refers to position 9, there are 3"),
     ] {
         let error = read(&folder.file("b.ply", text)).map(|_| ()).expect_err("refused").to_string();
         assert!(error.contains(expected), "{error}");
