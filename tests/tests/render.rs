@@ -84,6 +84,18 @@ fn presets_change_what_is_seen() {
     assert!(plain == alpha("--preset inria"));
 }
 
+/// A folder holds the pictures of its cameras and no others.
+#[test]
+fn pictures_of_older_cameras_go() {
+    let place = Workplace::empty();
+    place.write("in.ply", ply_bytes(&cloud(20, 0), Format::Little, "", b""));
+    for (count, last) in [(5, "004.png"), (2, "001.png")] {
+        succeed(&mut run(&place, &format!("in.ply --orbit {count} --size 8x8 --quiet -o views")));
+        assert!(place.path("views").join(last).exists());
+    }
+    assert!(!place.path("views/002.png").exists() && !place.path("views/004.png").exists());
+}
+
 #[test]
 fn unsuitable_files_and_arguments_are_refused_by_name() {
     let place = Workplace::empty();

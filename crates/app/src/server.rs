@@ -285,3 +285,23 @@ fn checked(parsed: &httparse::Request) -> Result<Request, Refusal> {
         length,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clients_that_leave_are_noticed() {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+        let client = TcpStream::connect(listener.local_addr().expect("bound")).expect("connects");
+        let (mut stream, _) = listener.accept().expect("a client");
+        let body = Body { stream: &mut stream, begun: Vec::new(), length: None };
+        assert!(body.is_awaited());
+        drop(client);
+        let end = Instant::now() + PATIENCE;
+        while body.is_awaited() {
+            assert!(Instant::now() < end, "a client that left is still awaited");
+            thread::sleep(Duration::from_millis(5));
+        }
+    }
+}

@@ -81,9 +81,9 @@ impl Hull {
 }
 
 /// Moves the sides' points that lie outside of the photographs' silhouettes, or before the surfaces of front and back,
-/// along their lines of sight until they do not (docs/method.md, "Points inside the silhouettes"). `masks` `[S, S]` belong to the photographs. `points`
-/// `[V, S, S, 3]` are metres in the front camera's frame. Points with a confidence `conf` `[V, S, S]` too low for a
-/// Gaussian stay. Returns the number of points that moved.
+/// along their lines of sight until they do not (docs/method.md, "Points inside the silhouettes"). `masks` `[S, S]`
+/// belong to the photographs. `points` `[V, S, S, 3]` are metres in the front camera's frame. Points with a confidence
+/// `conf` `[V, S, S]` too low for a Gaussian stay. Returns the number of points that moved.
 pub(crate) fn carve(config: &NetworkConfig, masks: [&[bool]; 2], points: &mut [f32], conf: &[f32]) -> usize {
     let (side, area) = (config.resolution, config.resolution * config.resolution);
     let reach = config.hull_reach();

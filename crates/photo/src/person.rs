@@ -22,7 +22,7 @@ pub const DISTANCES: RangeInclusive<f64> = 1.0..=30.0;
 /// Assumed height of a person whose height is not given, in metres.
 const USUAL: f64 = 1.72;
 /// Largest height of a person over its height in the nominal cameras, with the same pictures. From 60° above and two
-/// metres away it is 3.4.
+/// metres away it is 3.1.
 const TALLEST: f64 = 4.0;
 
 /// What a user says of the photographs.

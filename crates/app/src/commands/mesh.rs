@@ -156,9 +156,8 @@ impl Target {
         }
         let bytes = TEXEL * (texture as u64).pow(2);
         memory::check(&format!("--texture {texture}"), bytes, "choose a smaller one")?;
-        let companions = export::companions(path, texture > 0);
         let options = Options { faces: surface.faces.unwrap_or(defaults.faces), texture, ..defaults };
-        Ok(Self { path: path.to_owned(), companions, options })
+        Ok(Self { path: path.to_owned(), companions: export::companions(path, texture > 0), options })
     }
 
     pub fn files(&self) -> Vec<&Path> {

@@ -58,10 +58,10 @@ struct Studio {
     start: u128,
 }
 
-/// A person, and its files that clients are reading, by extension.
+/// A person, and its files that clients are reading, by extension: those that are made at once, and those that take long.
 struct Person {
     stored: Stored,
-    files: Mutex<HashMap<&'static str, Weak<server::Bytes>>>,
+    files: [Mutex<HashMap<&'static str, Weak<server::Bytes>>>; 2],
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
@@ -181,7 +181,7 @@ impl Studio {
         let gaussians = stored.len();
         let mut people = self.people.lock().unwrap_or_else(PoisonError::into_inner);
         people.truncate(KEPT - 1);
-        people.push_front((name.clone(), Arc::new(Person { stored, files: Mutex::default() })));
+        people.push_front((name.clone(), Arc::new(Person { stored, files: Default::default() })));
         let seconds = start.elapsed().as_secs_f64();
         let made = json!({ "name": name, "gaussians": gaussians, "seconds": seconds, "warnings": doubts });
         Ok(page::answer("application/json", Arc::new(made.to_string())))
@@ -199,18 +199,12 @@ impl Studio {
         let message = format!("this person is no longer in memory (the last {KEPT} are kept): make it again");
         let person = found.ok_or_else(|| text(StatusCode::NOT_FOUND, &message))?;
         downloads::answer(request, "human", (extension, download), |step| {
-            let files = || person.files.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some(content) = files().get(extension).and_then(Weak::upgrade) {
+            let files = &person.files[usize::from(download.is_long())];
+            let mut files = files.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(content) = files.get(extension).and_then(Weak::upgrade) {
                 return Ok(content);
             }
-            // Long work must not keep other files waiting.
-            let made = if download.is_long() { Some(download.make(&person.stored, step)?) } else { None };
-            let mut files = files();
-            let content: server::Content = match (made, files.get(extension).and_then(Weak::upgrade)) {
-                (Some(made), _) => Arc::new(made),
-                (None, Some(content)) => content,
-                (None, None) => Arc::new(download.make(&person.stored, step)?),
-            };
+            let content: server::Content = Arc::new(download.make(&person.stored, step)?);
             files.insert(extension, Arc::downgrade(&content));
             Ok(content)
         })

@@ -14,7 +14,7 @@ use super::convert::{drawable, read};
 use crate::downloads::{self, Download};
 use crate::failure::Failure;
 use crate::page::{self, PageArguments, busy, text};
-use crate::server::{Answer, Content, Request};
+use crate::server::{Answer, Bytes, Content, Request};
 
 #[derive(Args)]
 pub struct Arguments {
@@ -37,7 +37,7 @@ type Made = Mutex<HashMap<&'static str, (Stamp, Content)>>;
 static MADE: [LazyLock<Made>; 2] = [LazyLock::new(Mutex::default), LazyLock::new(Mutex::default)];
 
 /// Contents of replaced files, which slow clients may still be reading.
-static FORMER: Mutex<Vec<Weak<dyn AsRef<[u8]> + Send + Sync>>> = Mutex::new(Vec::new());
+static FORMER: Mutex<Vec<Weak<Bytes>>> = Mutex::new(Vec::new());
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let input = arguments.input.as_path();

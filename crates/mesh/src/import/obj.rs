@@ -16,7 +16,7 @@ const UNUSED: f64 = 0.05;
 
 /// The statements of a file.
 #[derive(Default)]
-struct Statements<'a> {
+struct Statements {
     positions: Vec<Vec3>,
     colors: Vec<Option<Vec3>>,
     texcoords: Vec<Vec2>,
@@ -24,9 +24,9 @@ struct Statements<'a> {
     corners: Vec<(usize, Option<usize>)>,
     faces: Vec<Polygon>,
     /// Names after `usemtl`, and the line of each.
-    used: Vec<(usize, Cow<'a, str>)>,
+    used: Vec<(usize, String)>,
     /// The `mtllib` statements.
-    libraries: Vec<Cow<'a, str>>,
+    libraries: Vec<String>,
     /// Number of vertices up to the last one that a face, a line or a point uses.
     last: usize,
     counts: Counts,
@@ -71,7 +71,7 @@ fn statements(text: &str) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
     })
 }
 
-impl Statements<'_> {
+impl Statements {
     fn add(&mut self, number: usize, line: &str) -> Result<(), String> {
         if line.len() > MAX_LINE {
             return Err(format!("longer than {MAX_LINE} bytes"));
@@ -107,8 +107,8 @@ impl Statements<'_> {
                 self.faces.push(Polygon { line: number, corners: corners.len(), material: self.used.len() });
                 self.corners.extend(corners);
             }
-            "usemtl" => self.used.push((number, Cow::Owned(rest.to_owned()))),
-            "mtllib" => self.libraries.push(Cow::Owned(rest.to_owned())),
+            "usemtl" => self.used.push((number, rest.to_owned())),
+            "mtllib" => self.libraries.push(rest.to_owned()),
             _ => {}
         }
         Ok(())
