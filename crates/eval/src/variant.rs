@@ -10,6 +10,9 @@ use snapsnap_data::sample::PhotographChanges;
 use snapsnap_net::config::Precision;
 use snapsnap_splat::Preset;
 
+/// How many times as large as the compared pictures renders may be on each side.
+pub const SUPERSAMPLING: [usize; 3] = [1, 2, 4];
+
 /// A section `[ablations.NAME]` of an evaluation, or `[model]` or `[settings.NAME]` of a benchmark. Unset keys have
 /// the values of the model under test.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -33,11 +36,12 @@ pub struct Variant {
     pub min_opacity: Option<f32>,
     /// Benchmarks: the property that is varied. Settings with the same knob belong together.
     pub knob: Option<String>,
-    /// Benchmarks: pictures are rendered this many times as large on each side, 1 or 2, and shrunk.
+    /// Pictures are rendered this many times as large on each side, one of [`SUPERSAMPLING`], and shrunk: enlarged
+    /// pictures show what the person looks like from near.
     pub supersampling: Option<usize>,
-    /// Benchmarks: constants of the rasteriser.
+    /// Constants of the rasteriser.
     pub preset: Option<Preset>,
-    /// Benchmarks: whether splats smaller than a pixel keep their weight.
+    /// Whether splats smaller than a pixel keep their weight.
     pub antialiased: Option<bool>,
     /// Benchmarks: the scene. Settings of a scene are compared with the scene's one setting that omits nothing.
     pub scene: Option<String>,
@@ -82,7 +86,7 @@ impl Variant {
             ("photographs", photographs.map(|(key, message)| format!("`{key}` {message}"))),
             ("inputs", self.inputs.as_deref().and_then(views_problem)),
             ("stride", must(self.stride.is_some_and(|n| !(1..=64).contains(&n)), "1 to 64")),
-            ("supersampling", must(self.supersampling.is_some_and(|n| ![1, 2].contains(&n)), "1 or 2")),
+            ("supersampling", must(self.supersampling.is_some_and(|n| !SUPERSAMPLING.contains(&n)), "1, 2 or 4")),
             ("min_opacity", must(self.min_opacity.is_some_and(|o| !(0.0..=1.0).contains(&o)), "0 to 1")),
         ];
         problems.into_iter().find_map(|(key, problem)| Some((key, problem?)))
@@ -90,8 +94,7 @@ impl Variant {
 
     /// The first key that is set and that only benchmarks have.
     pub(crate) fn key_of_benchmarks(&self) -> Option<&'static str> {
-        const KEYS: [&str; 9] =
-            ["knob", "supersampling", "preset", "antialiased", "scene", "omits", "data", "only", "inputs"];
+        const KEYS: [&str; 6] = ["knob", "scene", "omits", "data", "only", "inputs"];
         let keys = self.keys();
         KEYS.into_iter().find(|key| keys.contains_key(*key))
     }

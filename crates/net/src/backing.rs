@@ -104,16 +104,16 @@ fn cells(origins: &[Origin], view: View, side: usize, [means, colors]: [&[f32]; 
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use burn::tensor::Device;
 
     use super::*;
     use crate::Points;
 
-    const SIDE: usize = 32;
+    pub(crate) const SIDE: usize = 32;
 
     /// A wall before the front's camera, `slope` metres deeper per metre to the right. Pixel (9, 12) has no Gaussian.
-    fn wall(slope: f32) -> Reconstruction {
+    pub(crate) fn wall(slope: f32) -> Reconstruction {
         let pixels = (4..24).flat_map(|row| (8..28).map(move |column| row * SIDE + column));
         let pixels: Vec<usize> = pixels.filter(|pixel| *pixel != 12 * SIDE + 9).collect();
         let (n, width, device) = (pixels.len(), pixel_width(SIDE), Device::flex());
@@ -143,7 +143,7 @@ mod tests {
         }
     }
 
-    fn config() -> Config {
+    pub(crate) fn config() -> Config {
         let mut config = Config::default();
         config.network.resolution = SIDE;
         config

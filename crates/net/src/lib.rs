@@ -8,6 +8,7 @@ mod hull;
 mod memory;
 mod nearest_colors;
 pub mod network;
+mod own_colors;
 pub mod painter;
 mod parameters;
 mod photograph;

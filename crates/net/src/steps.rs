@@ -108,6 +108,11 @@ pub enum Step {
         /// Their number.
         gaussians: usize,
     },
+    /// Gaussians whose colours were corrected by the render of their photograph's view.
+    OwnColors {
+        /// Their number.
+        gaussians: usize,
+    },
     /// Gaussians behind the surface.
     Backing {
         /// Their number.
@@ -178,6 +183,7 @@ impl fmt::Display for Step {
             Self::OffSurface { gaussians } => {
                 write!(f, "{gaussians} Gaussians left out: they hang off the person's surface")
             }
+            Self::OwnColors { gaussians } => write!(f, "own colours: {gaussians} Gaussians corrected"),
             Self::Backing { gaussians } => write!(f, "backing: {gaussians} Gaussians behind the surface"),
             Self::GaussiansNotFinite { gaussians } => {
                 write!(f, "{gaussians} Gaussians left out: their attributes are not finite")

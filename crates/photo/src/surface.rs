@@ -1,4 +1,5 @@
-//! A person's Gaussians on one closed surface with a backing (docs/method.md, "One surface", "Backing").
+//! A person's Gaussians on one closed surface, in the photographs' colours and with a backing (docs/method.md, "One
+//! surface", "Own colours", "Backing").
 
 use std::time::Instant;
 
@@ -10,8 +11,8 @@ use snapsnap_ops::host;
 /// Least share of the Gaussians on the surface of a body. Below it the networks made no body.
 const BODY: f64 = 0.5;
 
-/// The Gaussians of a front and a back photograph, without Gaussians that hang off the person's surface, and with a
-/// backing. With the published weights and without sides, the Gaussians are as the networks made them.
+/// The Gaussians of a front and a back photograph, without Gaussians that hang off the person's surface, sharp in the
+/// photographs' views, and with a backing. With the published weights and without sides, the Gaussians are as the networks made them.
 ///
 /// # Panics
 /// If a photograph's arrays do not have the canvas size.
@@ -35,6 +36,7 @@ pub fn reconstruct(
     if count as f64 >= BODY * is_on.len() as f64 {
         made.drop_off_surface(&is_on);
     }
+    made.restore_own_colors(config, photographs);
     made.add_backing(config);
     made.times.push((STAGE, since.elapsed()));
     made

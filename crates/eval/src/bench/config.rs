@@ -85,16 +85,13 @@ impl BenchConfig {
     /// The config of the evaluation of a variant's pictures.
     pub(super) fn evaluation(&self, variant: &Variant) -> EvalConfig {
         let only = variant.only.as_ref().unwrap_or(&self.data.only).clone();
-        let (views, metrics) = (ViewsSection::default(), MetricsSection::default());
+        let metrics = MetricsSection::default();
         EvalConfig {
             data: DataSection { subjects: self.bench.people, only, ..self.data.clone() },
             views: ViewsSection {
                 inputs: variant.inputs.clone().unwrap_or_default(),
                 resolution: self.bench.resolution,
-                supersampling: variant.supersampling.unwrap_or(views.supersampling),
-                preset: variant.preset.unwrap_or(views.preset),
-                antialiased: variant.antialiased.unwrap_or(views.antialiased),
-                ..views
+                ..ViewsSection::default().of(variant)
             },
             metrics: MetricsSection { protocols: vec![Protocol::Masked], geometry: false, ..metrics },
             ..EvalConfig::default()

@@ -10,7 +10,7 @@ use snapsnap_data::sample::PhotographChanges;
 use snapsnap_splat::{Preset, RenderOptions};
 
 use crate::geometry::Align;
-use crate::variant::{Variant, names_twice, views_problem};
+use crate::variant::{SUPERSAMPLING, Variant, names_twice, views_problem};
 
 /// The config of an evaluation.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -92,7 +92,7 @@ pub struct ViewsSection {
     pub turns: Vec<usize>,
     /// Side of the compared pictures in pixels, a divisor of the data set's side; 0: the data set's side.
     pub resolution: usize,
-    /// Pictures are rendered this many times as large on each side, 1 or 2, and shrunk.
+    /// Pictures are rendered this many times as large on each side, one of [`SUPERSAMPLING`], and shrunk.
     pub supersampling: usize,
     /// Compared views. Input views are left out. Empty: all.
     pub compared: Vec<usize>,
@@ -117,6 +117,16 @@ impl Default for ViewsSection {
 }
 
 impl ViewsSection {
+    /// The section with the renders of a variant.
+    pub fn of(&self, variant: &Variant) -> Self {
+        Self {
+            supersampling: variant.supersampling.unwrap_or(self.supersampling),
+            preset: variant.preset.unwrap_or(self.preset),
+            antialiased: variant.antialiased.unwrap_or(self.antialiased),
+            ..self.clone()
+        }
+    }
+
     /// Options of a render over black.
     pub fn render_options(&self) -> RenderOptions {
         RenderOptions { antialiased: self.antialiased, ..self.preset.options() }
@@ -296,7 +306,7 @@ impl EvalConfig {
             ("views.turns", names_twice(&views.turns), "names a view twice"),
             ("views.compared", names_twice(&views.compared), "names a view twice"),
             ("views.turns", !(1..=64).contains(&views.turns.len()), "must have 1 to 64 entries"),
-            ("views.supersampling", ![1, 2].contains(&views.supersampling), "must be 1 or 2"),
+            ("views.supersampling", !SUPERSAMPLING.contains(&views.supersampling), "must be 1, 2 or 4"),
             (
                 "metrics.protocols",
                 metrics.protocols.is_empty(),

@@ -86,6 +86,11 @@ impl Contestant {
         if let Self::Model(_, kind, _) = self { *kind } else { Kind::Baseline }
     }
 
+    /// How the contestant's pictures are rendered.
+    pub(super) fn views(&self, views: &ViewsSection) -> ViewsSection {
+        if let Self::Model(.., model) = self { views.of(&model.variant) } else { views.clone() }
+    }
+
     /// The result for a person's photographs. `canvas` is the side of the baselines' canvas in pixels. Models are
     /// aligned with the truth as `metrics` says.
     ///
@@ -180,7 +185,7 @@ impl Contestant {
         views: &ViewsSection,
     ) -> Result<Picture, EvalError> {
         match (&shown.gaussians, self) {
-            (Some(gaussians), _) => rendered(gaussians, camera, side, views),
+            (Some(gaussians), _) => rendered(gaussians, camera, side, &self.views(views)),
             (None, Self::Mean(pictures)) => pictures.picture(view, side),
             (None, _) => Err(EvalError::Message("there is nothing to render".into())),
         }

@@ -211,7 +211,8 @@ impl Place<'_> {
         // A GPU runs one task at a time.
         let is_on_gpu = |gaussians: &Gaussians| gaussians.device().identity().is_some();
         let any_on_gpu = shown.iter().flatten().filter_map(|made| made.gaussians.as_ref()).any(is_on_gpu);
-        let most = if any_on_gpu { 1 } else { at_once(side * config.views.supersampling) };
+        let times = contestants.iter().map(|contestant| contestant.views(&config.views).supersampling).max();
+        let most = if any_on_gpu { 1 } else { at_once(side * times.unwrap_or(1)) };
         let found = compared.chunks(most).flat_map(|views| match views {
             [view] => vec![compare(view)],
             views => views.par_iter().map(compare).collect(),

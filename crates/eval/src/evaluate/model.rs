@@ -25,10 +25,10 @@ use crate::variant::Variant;
 /// The networks of a variant on a device.
 pub struct Model {
     reconstructor: Reconstructor,
-    stride: usize,
-    min_opacity: f32,
     /// Changes to the photographs that the model gets.
     pub photographs: PhotographChanges,
+    /// What was loaded.
+    pub variant: Variant,
 }
 
 /// The reconstruction of a person.
@@ -69,9 +69,8 @@ impl Model {
         }
         Ok(Self {
             reconstructor,
-            stride: variant.stride.unwrap_or(1),
-            min_opacity: variant.min_opacity.unwrap_or(0.0),
             photographs: variant.photographs.unwrap_or_default(),
+            variant: variant.clone(),
         })
     }
 
@@ -243,7 +242,8 @@ impl Model {
         origins: &[Origin],
         only_front: bool,
     ) -> (Gaussians, Vec<Origin>) {
-        let Self { stride, min_opacity, .. } = *self;
+        let Variant { stride, min_opacity, .. } = self.variant;
+        let (stride, min_opacity) = (stride.unwrap_or(1), min_opacity.unwrap_or(0.0));
         if stride == 1 && min_opacity <= 0.0 && !only_front {
             return (gaussians, origins.to_vec());
         }

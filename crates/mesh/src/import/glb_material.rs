@@ -163,8 +163,8 @@ impl File<'_> {
     }
 }
 
-/// 0 where the opacity of a texture times `factor` is below `least`; `None` if it is nowhere.
-fn cut_out(texture: &DynamicImage, factor: f32, least: f32) -> Option<Arc<GrayImage>> {
+/// 0 where the alpha of a texture times `factor` is below `least`; `None` if it is nowhere.
+pub fn cut_out(texture: &DynamicImage, factor: f32, least: f32) -> Option<Arc<GrayImage>> {
     let texture = texture.to_rgba8();
     let is_solid = |alpha: u8| f32::from(alpha) / 255.0 * factor >= least;
     let solid = |x, y| Luma([if is_solid(texture.get_pixel(x, y)[3]) { u8::MAX } else { 0 }]);

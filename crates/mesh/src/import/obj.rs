@@ -2,12 +2,16 @@
 
 use std::borrow::Cow;
 use std::path::Path;
+use std::sync::Arc;
 
 use glam::{Vec2, Vec3};
+use image::{GrayImage, Rgba, RgbaImage};
 use snapsnap_base::{FileError, file, quoted};
 
-use super::{MAX_BYTES, Textures, beside, triangles};
+use super::glb_material::cut_out;
+use super::{MAX_BYTES, MAX_TEXTURE, Textures, beside, triangles};
 use crate::mesh::{Face, Material, Mesh};
+use crate::picture::decode;
 
 /// Longest line in bytes.
 const MAX_LINE: usize = 1 << 20;
@@ -147,12 +151,14 @@ impl Statements {
         }
         let (mut known, mut textures) = (Vec::new(), Textures::new());
         for file in files {
-            for Described { name, color, texture } in read_materials(&file)? {
+            for Described { name, color, texture, opacity } in read_materials(&file)? {
                 let texture = texture.map(|statement| textures.beside(path, file_name(&statement)));
                 // Exporters leave the colour black or grey where a texture replaces it.
                 let color = color.filter(|_| texture.is_none()).unwrap_or(Vec3::ONE);
                 let color = color.clamp(Vec3::ZERO, Vec3::ONE);
-                mesh.materials.push(Material { color, texture: texture.transpose()?, ..Material::default() });
+                let opacity = opacity.map(|statement| cut_outs(path, file_name(&statement))).transpose()?;
+                let (texture, opacity) = (texture.transpose()?, opacity.flatten());
+                mesh.materials.push(Material { color, texture, opacity });
                 known.push(name);
             }
         }
@@ -338,6 +344,18 @@ fn read_lossy(path: &Path) -> Result<String, FileError> {
     Ok(String::from_utf8(bytes).unwrap_or_else(|e| String::from_utf8_lossy(e.as_bytes()).into_owned()))
 }
 
+/// 0 where the surface is cut out by the picture in a `map_d` statement: where its alpha, or without alpha its
+/// brightness, is below ½.
+fn cut_outs(owner: &Path, name: &str) -> Result<Option<Arc<GrayImage>>, FileError> {
+    let mut picture = decode(&beside(owner, "texture", name)?, MAX_TEXTURE)?;
+    if !picture.color().has_alpha() {
+        let brightness = picture.into_luma8();
+        let mask = |x, y| Rgba([0, 0, 0, brightness.get_pixel(x, y)[0]]);
+        picture = RgbaImage::from_fn(brightness.width(), brightness.height(), mask).into();
+    }
+    Ok(cut_out(&picture, 1.0, 0.5))
+}
+
 /// A material of an MTL file.
 #[derive(Default)]
 struct Described {
@@ -345,6 +363,8 @@ struct Described {
     color: Option<Vec3>,
     /// The text after `map_Kd`.
     texture: Option<String>,
+    /// The text after `map_d`.
+    opacity: Option<String>,
 }
 
 /// Reads names, colours and textures of materials.
@@ -367,6 +387,7 @@ fn read_materials(path: &Path) -> Result<Vec<Described>, FileError> {
                 material.color = Some(color.ok_or_else(|| FileError::unsuitable(path, message()))?);
             }
             ("map_kd", Some(material)) => material.texture = Some(rest.to_owned()),
+            ("map_d", Some(material)) => material.opacity = Some(rest.to_owned()),
             _ => {}
         }
     }

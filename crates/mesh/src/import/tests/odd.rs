@@ -58,6 +58,25 @@ fn objs_of_every_writer_are_read() {
     assert_eq!(mesh.positions.len(), 3, "a vertex without a face is no part of the surface");
     let [a, b] = [0, 1].map(|face| &mesh.materials[mesh.faces[face].material as usize]);
     assert!(a.color == Vec3::X && a.texture.is_none() && b.texture.is_some());
+    assert!(a.opacity.is_none() && b.opacity.is_none());
+
+    // Hair cards: the picture of `map_d` cuts them out by its alpha, or else by its brightness.
+    let bytes = |picture: image::DynamicImage| {
+        let mut png = Cursor::new(Vec::new());
+        picture.write_to(&mut png, ImageFormat::Png).expect("a picture");
+        png.into_inner()
+    };
+    let half = |x: u32| if x == 0 { 40 } else { 200 };
+    let grey = image::GrayImage::from_fn(2, 1, |x, _| image::Luma([half(x)]));
+    let clear = RgbaImage::from_fn(2, 1, |x, _| image::Rgba([255, 255, 255, half(x)]));
+    for (name, picture) in [("grey.png", grey.into()), ("clear.png", clear.into())] {
+        folder.file(name, bytes(picture));
+        folder.file("b.mtl", format!("newmtl b\nmap_kd skin.png\nmap_d -imfchan m {name}\n"));
+        let mesh = read(&folder.file("a.obj", format!("{start}{faces}"))).expect("reads");
+        let hair = &mesh.materials[mesh.faces[1].material as usize];
+        let opacity = hair.opacity.as_ref().expect("is cut out");
+        assert_eq!(opacity.as_raw(), &[0, 255], "{name}");
+    }
     // Some vertices have colours; the others are white.
     let mixed = "v 0 0 0\nv 1 0 0 1 0 0 0.5\nv 0 1 0\nv 5 5 5 0 0 1\nf 1 2 3\n";
     assert_eq!(read(&folder.file("b.obj", mixed)).expect("reads").colors, [Vec3::ONE, Vec3::X, Vec3::ONE]);
