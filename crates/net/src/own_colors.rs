@@ -37,7 +37,8 @@ impl Reconstruction {
             let (color, alpha) = (host(seen.color), host(seen.alpha));
             let depth = seen.depth.map(host).unwrap_or_default();
             let away = camera.world_to_camera;
-            for (i, origin) in self.origins.iter().enumerate().filter(|(_, origin)| origin.view == Some(view)) {
+            for (i, origin) in self.origins.iter().enumerate().filter(|(_, origin)| origin.view == Some(view))
+            {
                 let pixel = origin.pixel as usize;
                 let mean = Vec3::from_slice(&means[3 * i..]).as_dvec3();
                 let is_seen = (depth[pixel] / alpha[pixel] - away.apply(mean).z as f32).abs() <= near;
@@ -80,7 +81,8 @@ mod tests {
         let mut made = wall(0.0);
         // The wall stands where each pixel sees its own Gaussian, and has a pattern of 3×3 pixels.
         let camera = nominal_camera(View::Front, config().network.pair_degrees, SIDE);
-        let [fx, cx, cy] = [camera.focal.x, camera.principal_point.x, camera.principal_point.y].map(|x| x as f32);
+        let [fx, cx, cy] =
+            [camera.focal.x, camera.principal_point.x, camera.principal_point.y].map(|x| x as f32);
         let at = |origin: &Origin, depth: f32| {
             let [x, y] = [origin.pixel as usize % SIDE, origin.pixel as usize / SIDE].map(|x| x as f32 + 0.5);
             [(x - cx) * depth / fx, (y - cy) * depth / fx, depth]

@@ -1,7 +1,7 @@
 //! Replaces colours that mix person and background by the person's own colours (docs/method.md, "Rims"). The sides get
 //! their colours from these pixels.
 
-use glam::Vec2;
+use glam::{Vec2, Vec3};
 use image::{GrayImage, RgbImage};
 
 use crate::INSIDE;
@@ -47,9 +47,11 @@ pub fn replace(
     let is_known = is_cut_out || background == Background::Visible && !colors.is_flat;
     let assumed = ((ASSUMED * scale).round() as i8).clamp(1, reach);
     let width = is_known.then(|| colors.mixed(&rim, reach)).flatten().unwrap_or(assumed);
+    let strands = colors.strands(&rim, rgb);
     // Whether a pixel shows the background, without a gap from the outline; and whether it is mixed.
     let mut shown = vec![false; rim.pixels.len()];
     let mut is_mixed = vec![false; rim.pixels.len()];
+    let mut hair = Vec::new();
     for (i, &at) in rim.pixels.iter().enumerate() {
         let (level, (x, y)) = (rim.levels[at], rim.place(at));
         let share = if is_known { colors.share(i, colors.outside[i]).0 } else { 0.0 };
@@ -59,8 +61,13 @@ pub fn replace(
             && share > 0.5
             && !is_kept(x, y)
             && (level == 1 || before.any(|to| shown[colors.index[to] as usize]));
-        let among_hair = share > STRANDS && is_hair(Vec2::new(x as f32, y as f32));
-        is_mixed[i] = level <= width || shown[i] || among_hair;
+        is_mixed[i] = level <= width || shown[i];
+        if is_known && is_hair(Vec2::new(x as f32, y as f32)) {
+            colors.inside[i] = strands[i];
+            if colors.share(i, colors.outside[i]).0 > STRANDS {
+                hair.push(i);
+            }
+        }
     }
     // From the deepest pixel outwards.
     for (i, &at) in rim.pixels.iter().enumerate().rev().filter(|(i, _)| is_mixed[*i]) {
@@ -75,10 +82,48 @@ pub fn replace(
             rgb.put_pixel(x, y, pixel(color));
         }
     }
+    for i in hair {
+        let (x, y) = rim.place(rim.pixels[i]);
+        rgb.put_pixel(x, y, pixel(strands[i]));
+    }
     width as usize
 }
 
 impl Colors {
+    /// [`Self::inside`] for strands of hair: the colour of a part that is thinner than the rim comes from behind the rim
+    /// on the shortest way through the mask, and is not the part's own.
+    fn strands(&self, rim: &Rim, rgb: &RgbImage) -> Vec<Vec3> {
+        let mut found: Vec<Option<Vec3>> = vec![None; rim.pixels.len()];
+        let behind =
+            |at: usize| rim.neighbours(at).filter(|to| rim.is_behind(*to)).map(|to| rim.color(rgb, to));
+        let mut last: Vec<(usize, Vec3)> =
+            rim.pixels.iter().filter_map(|at| Some((*at, mean(behind(*at))?))).collect();
+        while !last.is_empty() {
+            last.iter().for_each(|(at, color)| found[self.index[*at] as usize] = Some(*color));
+            let reached = |to: &usize| found[self.index[*to] as usize];
+            let mut next: Vec<usize> = last.iter().flat_map(|(at, _)| rim.neighbours(*at)).collect();
+            next.retain(|to| rim.levels[*to] > 0 && !rim.is_behind(*to) && reached(to).is_none());
+            next.sort_unstable();
+            next.dedup();
+            let color = |at: usize| {
+                let around = rim.neighbours(at).filter(|to| rim.levels[*to] > 0 && !rim.is_behind(*to));
+                mean(around.filter_map(|to| reached(&to)))
+            };
+            last = next.into_iter().filter_map(|at| Some((at, color(at)?))).collect();
+        }
+        let mut strands: Vec<Vec3> =
+            found.iter().zip(&self.own).map(|(found, own)| found.unwrap_or(*own)).collect();
+        for (i, &at) in rim.pixels.iter().enumerate().rev() {
+            let deeper =
+                rim.neighbours(at).filter(|to| rim.levels[*to] > rim.levels[at] && !rim.is_behind(*to));
+            let deeper = deeper.map(|to| strands[self.index[to] as usize]);
+            if let Some(color) = mean(behind(at).chain(deeper)) {
+                strands[i] = color;
+            }
+        }
+        strands
+    }
+
     /// The number of levels that mix both colours, from the outline inwards. `None` if the colours are too similar.
     fn mixed(&self, rim: &Rim, reach: i8) -> Option<i8> {
         // Sum of the background's shares, and number of pixels with distinct colours.
@@ -101,6 +146,7 @@ impl Colors {
 mod tests {
     use super::*;
     use crate::rim::tests::{BACKGROUNDS, error, mask, outside, picture};
+    use crate::unit_color;
 
     /// An outline as soft as a camera's, with the true mask: the colours of the person are found, those inside stay.
     #[test]
@@ -122,6 +168,30 @@ mod tests {
                 widths.push(width);
             }
             assert!(widths.is_sorted() && widths[2] > widths[0], "{name}: {widths:?}");
+        }
+    }
+
+    /// Strands are thinner than the rim, and the background shines through them. They get the colour behind the rim.
+    #[test]
+    fn strands_get_the_colour_of_the_hair_that_they_hang_on() {
+        let hair = Vec3::new(0.15, 0.1, 0.08);
+        let is_strand = |x: u32, y: u32| y < 200 && x % 16 < 5 && (0.0..25.0).contains(&outside(x, y));
+        for (name, background) in [BACKGROUNDS[0], BACKGROUNDS[3]] {
+            let mut mask = mask(0.0);
+            mask.enumerate_pixels_mut().filter(|(x, y, _)| is_strand(*x, *y)).for_each(|(.., m)| m.0 = [255]);
+            let mut rgb = RgbImage::from_fn(mask.width(), mask.height(), |x, y| {
+                let share = if is_strand(x, y) { 0.4 } else { outside(x, y).clamp(-0.5, 0.5) + 0.5 };
+                pixel(hair.lerp(background(x, y), share))
+            });
+            let error = |rgb: &RgbImage| {
+                let strands = rgb.enumerate_pixels().filter(|(x, y, _)| is_strand(*x, *y));
+                let off: Vec<f32> = strands.map(|(.., color)| unit_color(color).distance(hair)).collect();
+                off.iter().sum::<f32>() / off.len() as f32
+            };
+            let before = error(&rgb);
+            replace(&mut rgb, &mask, Background::OfNetwork, |_| true, |_, _| false);
+            let after = error(&rgb);
+            assert!(before > 0.2 && after < 0.25 * before, "{name}: {before} → {after}");
         }
     }
 

@@ -85,6 +85,11 @@ impl Rim {
         Some(rim)
     }
 
+    /// Whether a pixel of the part is inside, behind the rim.
+    pub fn is_behind(&self, at: usize) -> bool {
+        self.levels[at] == DEEP
+    }
+
     /// Column and row of a pixel of the part in the picture.
     pub fn place(&self, at: usize) -> (u32, u32) {
         let at = at as u32;
