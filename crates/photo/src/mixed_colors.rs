@@ -46,7 +46,7 @@ pub fn replace(
     let is_cut_out = background == Background::OfNetwork;
     let is_known = is_cut_out || background == Background::Visible && !colors.is_flat;
     let assumed = ((ASSUMED * scale).round() as i8).clamp(1, reach);
-    let width = is_known.then(|| colors.mixed(&rim, reach)).flatten().unwrap_or(assumed);
+    let width = is_known.then(|| colors.mixed(&rim, reach)).flatten().map_or(assumed, |width| width.max(assumed));
     let strands = colors.strands(&rim, rgb);
     // Whether a pixel shows the background, without a gap from the outline; and whether it is mixed.
     let mut shown = vec![false; rim.pixels.len()];
