@@ -305,6 +305,7 @@ fn nothing_shines_through_a_person_from_near() {
             }
         }
         assert!(judged > SIDE * SIDE / 4, "{yaw}°: {judged} pixels");
+        println!("{yaw}°: {clear} of {judged} pixels are not opaque");
         assert!(clear as f64 <= 0.005 * judged as f64, "{yaw}°: {clear} of {judged} pixels are not opaque");
     }
 }

@@ -22,13 +22,14 @@ const NEAR: f32 = 4.0;
 
 impl Reconstruction {
     /// Adds a share of the difference between photograph and render to the colour of each pixel's own Gaussian, where
-    /// the Gaussian is visible. Gaussians without a photograph keep their colours. A view that cannot be rendered
-    /// stays as it is.
+    /// the Gaussian is visible, and lowers its opacity by the same share of the background in the pixel, so that outlines
+    /// are soft. Gaussians without a photograph stay as they are, and so does a view that cannot be rendered.
     pub fn restore_own_colors(&mut self, config: &Config, photographs: [&Photograph; 2]) {
         let side = config.network.resolution;
         let near = NEAR * pixel_width(side);
         let means = host(self.gaussians.means.clone());
         let mut colors = host(self.gaussians.colors.clone());
+        let mut opacities = host(self.gaussians.opacities.clone());
         let mut restored = 0;
         for (view, photograph) in [View::Front, View::Back].into_iter().zip(photographs) {
             let camera = nominal_camera(view, config.network.pair_degrees, side);
@@ -42,6 +43,7 @@ impl Reconstruction {
                 let pixel = origin.pixel as usize;
                 let mean = Vec3::from_slice(&means[3 * i..]).as_dvec3();
                 let is_seen = (depth[pixel] / alpha[pixel] - away.apply(mean).z as f32).abs() <= near;
+                opacities[i] *= 1.0 - SHARE * (1.0 - photograph.mask[pixel]);
                 if !is_seen || photograph.mask[pixel].min(alpha[pixel]) < INSIDE {
                     continue;
                 }
@@ -53,8 +55,9 @@ impl Reconstruction {
                 restored += 1;
             }
         }
-        let rows = TensorData::new(colors, [self.origins.len(), 3]);
-        self.gaussians.colors = Tensor::from_data(rows, &self.gaussians.device());
+        let (n, device) = (self.origins.len(), self.gaussians.device());
+        self.gaussians.colors = Tensor::from_data(TensorData::new(colors, [n, 3]), &device);
+        self.gaussians.opacities = Tensor::from_data(TensorData::new(opacities, [n]), &device);
         self.steps.push(Step::OwnColors { gaussians: restored });
     }
 }
@@ -90,8 +93,9 @@ mod tests {
         let is_bright = |pixel: usize| (pixel % SIDE / 3 + pixel / SIDE / 3).is_multiple_of(2);
         let pattern = |pixel: usize| if is_bright(pixel) { 0.7_f32 } else { 0.3 };
         let n = made.origins.len();
-        // The last Gaussian lies behind the wall.
-        let depth = |i: usize| if i + 1 == n { 2.5 } else { 2.0 };
+        // One Gaussian in the middle lies behind the wall.
+        let hidden = n / 2;
+        let depth = |i: usize| if i == hidden { 3.0 } else { 2.0 };
         let rows = |values: Vec<f32>| {
             let columns = values.len() / n;
             Tensor::<2>::from_data(TensorData::new(values, [n, columns]), &made.gaussians.device())
@@ -102,14 +106,18 @@ mod tests {
         made.gaussians.means = means;
         made.gaussians.colors = colors;
         let rgb: Vec<f32> = (0..3 * SIDE * SIDE).map(|i| 2.0 * pattern(i % (SIDE * SIDE)) - 1.0).collect();
-        let photograph = Photograph::new(rgb, vec![1.0; SIDE * SIDE]);
+        let mut photograph = Photograph::new(rgb, vec![1.0; SIDE * SIDE]);
+        let rim = made.origins[0].pixel as usize;
+        photograph.mask[rim] = 0.6;
 
         let before = (error(&made, &photograph), host(made.gaussians.colors.clone()));
         made.restore_own_colors(&config(), [&photograph, &photograph]);
         let after = error(&made, &photograph);
         assert!(before.0 > 0.02 && after < 0.8 * before.0, "{} {after}", before.0);
+        let opacities = host(made.gaussians.opacities.clone());
+        assert!((opacities[0] - 0.8).abs() < 1e-6 && opacities[1..].iter().all(|opacity| *opacity == 1.0));
         let colors = host(made.gaussians.colors.clone());
-        assert_eq!(colors[3 * (n - 1)..], before.1[3 * (n - 1)..]);
+        assert_eq!(colors[3 * hidden..][..3], before.1[3 * hidden..][..3]);
         assert!(colors.iter().all(|value| (0.0..=1.0).contains(value)));
         assert!(matches!(made.steps.last(), Some(Step::OwnColors { gaussians }) if *gaussians > 200));
     }

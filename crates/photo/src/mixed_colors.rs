@@ -46,12 +46,12 @@ pub fn replace(
     let is_cut_out = background == Background::OfNetwork;
     let is_known = is_cut_out || background == Background::Visible && !colors.is_flat;
     let assumed = ((ASSUMED * scale).round() as i8).clamp(1, reach);
-    let width = is_known.then(|| colors.mixed(&rim, reach)).flatten().map_or(assumed, |width| width.max(assumed));
+    let width = is_known.then(|| colors.mixed(&rim, reach)).flatten().unwrap_or(assumed);
     let strands = colors.strands(&rim, rgb);
     // Whether a pixel shows the background, without a gap from the outline; and whether it is mixed.
     let mut shown = vec![false; rim.pixels.len()];
     let mut is_mixed = vec![false; rim.pixels.len()];
-    let mut hair = Vec::new();
+    let mut is_strand = vec![false; rim.pixels.len()];
     for (i, &at) in rim.pixels.iter().enumerate() {
         let (level, (x, y)) = (rim.levels[at], rim.place(at));
         let share = if is_known { colors.share(i, colors.outside[i]).0 } else { 0.0 };
@@ -64,9 +64,8 @@ pub fn replace(
         is_mixed[i] = level <= width || shown[i];
         if is_known && is_hair(Vec2::new(x as f32, y as f32)) {
             colors.inside[i] = strands[i];
-            if colors.share(i, colors.outside[i]).0 > STRANDS {
-                hair.push(i);
-            }
+            is_strand[i] = colors.share(i, colors.outside[i]).0 > STRANDS;
+            is_mixed[i] |= is_strand[i];
         }
     }
     // From the deepest pixel outwards.
@@ -76,15 +75,11 @@ pub fn replace(
             u32::MAX => rim.color(rgb, to),
             index => colors.own[index as usize],
         };
-        if let Some(color) = mean(deeper.map(color)) {
+        if let Some(color) = mean(deeper.map(color)).or(is_strand[i].then_some(strands[i])) {
             colors.own[i] = color;
             let (x, y) = rim.place(at);
             rgb.put_pixel(x, y, pixel(color));
         }
-    }
-    for i in hair {
-        let (x, y) = rim.place(rim.pixels[i]);
-        rgb.put_pixel(x, y, pixel(strands[i]));
     }
     width as usize
 }
