@@ -1,7 +1,7 @@
 //! Replaces colours that mix person and background by the person's own colours (docs/method.md, "Rims"). The sides get
 //! their colours from these pixels.
 
-use glam::{Vec2, Vec3};
+use glam::Vec2;
 use image::{GrayImage, RgbImage};
 
 use crate::INSIDE;
@@ -47,7 +47,12 @@ pub fn replace(
     let is_known = is_cut_out || background == Background::Visible && !colors.is_flat;
     let assumed = ((ASSUMED * scale).round() as i8).clamp(1, reach);
     let width = is_known.then(|| colors.mixed(&rim, reach)).flatten().unwrap_or(assumed);
-    let strands = colors.strands(&rim, rgb);
+    let is_hair = |at: usize| {
+        let (x, y) = rim.place(at);
+        is_known && is_hair(Vec2::new(x as f32, y as f32))
+    };
+    let has_hair = rim.pixels.iter().any(|at| is_hair(*at));
+    let strands = if has_hair { colors.strands(&rim, rgb) } else { Vec::new() };
     // Whether a pixel shows the background, without a gap from the outline; and whether it is mixed.
     let mut shown = vec![false; rim.pixels.len()];
     let mut is_mixed = vec![false; rim.pixels.len()];
@@ -62,7 +67,7 @@ pub fn replace(
             && !is_kept(x, y)
             && (level == 1 || before.any(|to| shown[colors.index[to] as usize]));
         is_mixed[i] = level <= width || shown[i];
-        if is_known && is_hair(Vec2::new(x as f32, y as f32)) {
+        if is_hair(at) {
             colors.inside[i] = strands[i];
             is_strand[i] = colors.share(i, colors.outside[i]).0 > STRANDS;
             is_mixed[i] |= is_strand[i];
@@ -75,7 +80,7 @@ pub fn replace(
             u32::MAX => rim.color(rgb, to),
             index => colors.own[index as usize],
         };
-        if let Some(color) = mean(deeper.map(color)).or(is_strand[i].then_some(strands[i])) {
+        if let Some(color) = mean(deeper.map(color)).or_else(|| is_strand[i].then(|| strands[i])) {
             colors.own[i] = color;
             let (x, y) = rim.place(at);
             rgb.put_pixel(x, y, pixel(color));
@@ -85,40 +90,6 @@ pub fn replace(
 }
 
 impl Colors {
-    /// [`Self::inside`] for strands of hair: the colour of a part that is thinner than the rim comes from behind the rim
-    /// on the shortest way through the mask, and is not the part's own.
-    fn strands(&self, rim: &Rim, rgb: &RgbImage) -> Vec<Vec3> {
-        let mut found: Vec<Option<Vec3>> = vec![None; rim.pixels.len()];
-        let behind =
-            |at: usize| rim.neighbours(at).filter(|to| rim.is_behind(*to)).map(|to| rim.color(rgb, to));
-        let mut last: Vec<(usize, Vec3)> =
-            rim.pixels.iter().filter_map(|at| Some((*at, mean(behind(*at))?))).collect();
-        while !last.is_empty() {
-            last.iter().for_each(|(at, color)| found[self.index[*at] as usize] = Some(*color));
-            let reached = |to: &usize| found[self.index[*to] as usize];
-            let mut next: Vec<usize> = last.iter().flat_map(|(at, _)| rim.neighbours(*at)).collect();
-            next.retain(|to| rim.levels[*to] > 0 && !rim.is_behind(*to) && reached(to).is_none());
-            next.sort_unstable();
-            next.dedup();
-            let color = |at: usize| {
-                let around = rim.neighbours(at).filter(|to| rim.levels[*to] > 0 && !rim.is_behind(*to));
-                mean(around.filter_map(|to| reached(&to)))
-            };
-            last = next.into_iter().filter_map(|at| Some((at, color(at)?))).collect();
-        }
-        let mut strands: Vec<Vec3> =
-            found.iter().zip(&self.own).map(|(found, own)| found.unwrap_or(*own)).collect();
-        for (i, &at) in rim.pixels.iter().enumerate().rev() {
-            let deeper =
-                rim.neighbours(at).filter(|to| rim.levels[*to] > rim.levels[at] && !rim.is_behind(*to));
-            let deeper = deeper.map(|to| strands[self.index[to] as usize]);
-            if let Some(color) = mean(behind(at).chain(deeper)) {
-                strands[i] = color;
-            }
-        }
-        strands
-    }
-
     /// The number of levels that mix both colours, from the outline inwards. `None` if the colours are too similar.
     fn mixed(&self, rim: &Rim, reach: i8) -> Option<i8> {
         // Sum of the background's shares, and number of pixels with distinct colours.
@@ -139,6 +110,8 @@ impl Colors {
 
 #[cfg(test)]
 mod tests {
+    use glam::Vec3;
+
     use super::*;
     use crate::rim::tests::{BACKGROUNDS, error, mask, outside, picture};
     use crate::unit_color;

@@ -85,11 +85,6 @@ impl Rim {
         Some(rim)
     }
 
-    /// Whether a pixel of the part is inside, behind the rim.
-    pub fn is_behind(&self, at: usize) -> bool {
-        self.levels[at] == DEEP
-    }
-
     /// Column and row of a pixel of the part in the picture.
     pub fn place(&self, at: usize) -> (u32, u32) {
         let at = at as u32;
@@ -147,16 +142,7 @@ impl Colors {
         }
         let own: Vec<Vec3> = rim.pixels.iter().map(|at| color(*at)).collect();
         // The person's colour comes outwards from behind the rim, the background's inwards from beyond it.
-        let mut inside = own.clone();
-        for (i, &at) in rim.pixels.iter().enumerate().rev() {
-            let level = rim.levels[at];
-            let of = |to: usize| match rim.levels[to] {
-                DEEP => Some(color(to)),
-                deeper if deeper == level + 1 => Some(inside[index[to] as usize]),
-                _ => None,
-            };
-            inside[i] = mean(rim.neighbours(at).filter_map(of)).unwrap_or(own[i]);
-        }
+        let inside = outwards(rim, rgb, &index, own.clone());
         let mut beyond: Vec<Vec3> = rim.beyond.iter().map(|at| color(*at)).collect();
         let is_flat = beyond.windows(2).all(|pair| pair[0] == pair[1]);
         for (i, &at) in rim.beyond.iter().enumerate().rev() {
@@ -177,6 +163,29 @@ impl Colors {
         Self { index, own, inside, outside, is_flat }
     }
 
+    /// [`Self::inside`] for strands of hair: the colour of a part that is thinner than the rim comes from behind the rim
+    /// on the shortest way through the mask, and is not the part's own.
+    pub fn strands(&self, rim: &Rim, rgb: &RgbImage) -> Vec<Vec3> {
+        let mut found: Vec<Option<Vec3>> = vec![None; rim.pixels.len()];
+        let in_rim = |at: usize| rim.neighbours(at).filter(|to| (1..DEEP).contains(&rim.levels[*to]));
+        let behind = |at: usize| rim.neighbours(at).filter(|to| rim.levels[*to] == DEEP);
+        let first =
+            rim.pixels.iter().filter_map(|at| Some((*at, mean(behind(*at).map(|to| rim.color(rgb, to)))?)));
+        let mut last: Vec<(usize, Vec3)> = first.collect();
+        while !last.is_empty() {
+            last.iter().for_each(|(at, color)| found[self.index[*at] as usize] = Some(*color));
+            let reached = |to: usize| found[self.index[to] as usize];
+            let mut next: Vec<usize> = last.iter().flat_map(|(at, _)| in_rim(*at)).collect();
+            next.retain(|to| reached(*to).is_none());
+            next.sort_unstable();
+            next.dedup();
+            last =
+                next.into_iter().filter_map(|at| Some((at, mean(in_rim(at).filter_map(reached))?))).collect();
+        }
+        let found = found.iter().zip(&self.own).map(|(found, own)| found.unwrap_or(*own)).collect();
+        outwards(rim, rgb, &self.index, found)
+    }
+
     /// The share of `background` in a pixel of the rim, and whether it differs from the person's colour.
     pub fn share(&self, i: usize, background: Vec3) -> (f32, bool) {
         let (person, line) = (self.inside[i], background - self.inside[i]);
@@ -188,6 +197,22 @@ impl Colors {
         let off = (self.own[i] - person - share * line).length();
         (if off > OFF_LINE.0 * length + OFF_LINE.1 { 0.0 } else { share.clamp(0.0, 1.0) }, true)
     }
+}
+
+/// Colours from behind the rim, carried outwards from level to level. Pixels without deeper neighbours keep `colors`.
+fn outwards(rim: &Rim, rgb: &RgbImage, index: &[u32], mut colors: Vec<Vec3>) -> Vec<Vec3> {
+    for (i, &at) in rim.pixels.iter().enumerate().rev() {
+        let level = rim.levels[at];
+        let of = |to: usize| match rim.levels[to] {
+            DEEP => Some(rim.color(rgb, to)),
+            deeper if deeper == level + 1 => Some(colors[index[to] as usize]),
+            _ => None,
+        };
+        if let Some(color) = mean(rim.neighbours(at).filter_map(of)) {
+            colors[i] = color;
+        }
+    }
+    colors
 }
 
 /// A colour with channels in [0, 1] as a pixel.

@@ -210,9 +210,9 @@ fn networks_of_neighbours_are_refused_for_other_photographs() {
     assert!(!temporary.path().join("human.ply").exists());
 }
 
-/// Changed photographs change the figures of their ablation. Placed photographs have no errors of points.
+/// Changed photographs and renders change the figures of their ablation. Placed photographs have no errors of points.
 #[test]
-fn photographs_are_changed_by_ablations() {
+fn photographs_and_renders_are_changed_by_ablations() {
     let temporary = tempfile::tempdir().expect("a folder");
     let report = temporary.path().join("report");
     let changes = [
@@ -223,7 +223,9 @@ fn photographs_are_changed_by_ablations() {
         ("same", "{exposure=0.0}"),
     ];
     let changes = changes.map(|(name, change)| format!("ablations.{name}.photographs={change}"));
-    let arguments: Vec<&str> = changes.iter().flat_map(|change| ["--set", change]).collect();
+    let renders = ["ablations.near.supersampling=4", "ablations.filtered.antialiased=true"];
+    let changes = changes.iter().map(String::as_str).chain(renders);
+    let arguments: Vec<&str> = changes.flat_map(|change| ["--set", change]).collect();
     succeed(&mut evaluate(people(), &report, &arguments));
     let found = json(&report);
     let psnr = |of: &Value| of["protocols"]["masked"]["psnr"]["mean"].as_f64().expect("a figure");
@@ -232,6 +234,10 @@ fn photographs_are_changed_by_ablations() {
     assert_eq!(psnr(other("same")), model);
     for name in ["brighter", "cut", "narrow", "placed"] {
         assert!((psnr(other(name)) - model).abs() > 0.05, "{name}: {} and {model} dB", psnr(other(name)));
+    }
+    for name in ["near", "filtered"] {
+        assert_ne!(psnr(other(name)), model, "{name}");
+        assert_eq!(other(name)["points_mm"], other("same")["points_mm"], "{name}");
     }
     // One stop too bright in front and one too dark behind.
     assert!(psnr(other("brighter")) < model - 1.0, "{} and {model} dB", psnr(other("brighter")));
@@ -371,6 +377,7 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     wrong(&["--set", "views.resolution=48"], &["64", "48"]);
     wrong(&["--set", "ablations.model.sides=false"], &["`model`", "another meaning"]);
     wrong(&["--set", "ablations.a.knob=\"all\""], &["ablations.a.knob", "only settings of"]);
+    wrong(&["--set", "ablations.a.supersampling=3"], &["ablations.a.supersampling", "1, 2 or 4"]);
     wrong(&["--set", "ablations.a.stride=0"], &["ablations.a.stride", "1 to 64"]);
     wrong(&["--set", "model.devices=[\"cpu\", \"cpu\"]"], &["on cpu", "two ablations or devices"]);
     wrong(&["--set", "report.people=9"], &["report.people"]);
