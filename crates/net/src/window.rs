@@ -6,7 +6,7 @@ use std::ops::Range;
 use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 
-use crate::config::Config;
+use crate::config::{Config, Sides};
 
 /// The regressor halves the image twice, so windows start and end at multiples of this.
 const ALIGNMENT: usize = 4;
@@ -53,7 +53,11 @@ impl Window {
         let side = config.network.resolution;
         let person = person.filter(|_| config.network.window);
         let cell = config.network.patch * config.upsample_factor();
-        let window = person.map_or_else(|| Self::whole(side), |person| person.in_cells(cell, side));
+        let mut window = person.map_or_else(|| Self::whole(side), |person| person.in_cells(cell, side));
+        if config.network.sides == Sides::Completed {
+            // From the side, the nearer foot of a person with the legs apart is lower than in the photographs.
+            window.rows.end = (window.rows.end + cell).min(side);
+        }
         if config.network.mirror || config.network.both_ways || config.network.details.is_some() {
             window.symmetric(side)
         } else {

@@ -1,5 +1,5 @@
-//! Closes narrow tunnels through a body, such as a hole between the shells of a shoulder. A morphological closing
-//! (dilation, then erosion) fills them; only the walls across tunnels are kept of it.
+//! Closes narrow tunnels through a body, such as a hole between the shells of a shoulder. A dilation fills them; it is
+//! thinned from outside inwards, and only the walls across tunnels are kept of it.
 
 use std::collections::VecDeque;
 use std::sync::LazyLock;
@@ -10,6 +10,9 @@ use super::grid::{Grid, STEPS};
 
 /// Width of the widest closed tunnel in cubes, 5 cm for a person of 1.7 m.
 const WIDEST: f32 = 8.0;
+
+/// Above the squares of all distances up to half of [`WIDEST`].
+const FAR: u8 = 17;
 
 /// The 14 corners that share an edge with a corner: their offsets, and bit sets of their neighbours among the 14. The
 /// edges are the edges of Kuhn's subdivision, in which corners that are neighbours in pairs form a simplex.
@@ -51,11 +54,10 @@ impl Grid {
     /// Closes the tunnels through the inside that are narrower than [`WIDEST`].
     pub fn close_tunnels(&mut self) {
         let inside: Vec<bool> = self.values.iter().map(|value| *value < 0.0).collect();
-        let outside: Vec<bool> = self.spread(&inside).into_iter().map(|grown| !grown).collect();
-        let outside = self.spread(&outside);
-        let is_added = |row: usize| !outside[row] && !inside[row] && !self.on_border(row);
+        let distances = self.distances(&inside);
+        let is_added = |row: usize| distances[row] < FAR && !inside[row] && !self.on_border(row);
 
-        // Thinning: added corners are removed from the surface inwards, unless two parts of the outside would meet.
+        // Thinning: the farthest added corners are removed first, unless two parts of the outside would meet.
         let steps = AROUND.map(|(offset, _)| self.step(offset));
         let near = |row: usize| steps.map(|step| row.wrapping_add_signed(step));
         let link = |kept: &[bool], row: usize| {
@@ -64,12 +66,22 @@ impl Grid {
         let all = (1 << 14) - 1;
         let added: Vec<usize> = (0..inside.len()).filter(|row| is_added(*row)).collect();
         let mut kept = inside.clone();
-        added.iter().for_each(|row| kept[*row] = true);
-        let mut waiting: VecDeque<usize> = added.iter().copied().collect();
-        while let Some(row) = waiting.pop_front() {
-            if kept[row] && CONNECTED[usize::from(!link(&kept, row) & all)] {
+        let mut waiting: [VecDeque<usize>; FAR as usize] = Default::default();
+        let mut is_waiting = vec![false; inside.len()];
+        for row in &added {
+            kept[*row] = true;
+            is_waiting[*row] = true;
+            waiting[distances[*row] as usize].push_back(*row);
+        }
+        while let Some(row) = waiting.iter_mut().rev().find_map(VecDeque::pop_front) {
+            is_waiting[row] = false;
+            if CONNECTED[usize::from(!link(&kept, row) & all)] {
                 kept[row] = false;
-                waiting.extend(near(row).into_iter().filter(|at| kept[*at] && is_added(*at)));
+                for at in near(row).into_iter().filter(|at| kept[*at] && is_added(*at)) {
+                    if !std::mem::replace(&mut is_waiting[at], true) {
+                        waiting[distances[at] as usize].push_back(at);
+                    }
+                }
             }
         }
 
@@ -93,32 +105,35 @@ impl Grid {
         offset.dot(I64Vec3::from_array(strides)) as isize
     }
 
-    /// Dilation by half of [`WIDEST`]: balls around the marked corners that have an unmarked neighbour.
-    fn spread(&self, marked: &[bool]) -> Vec<bool> {
+    /// Squared distances from the marked corners in cubes; [`FAR`] beyond half of [`WIDEST`].
+    fn distances(&self, marked: &[bool]) -> Vec<u8> {
         let reach = 0.5 * WIDEST;
         let side = reach as i64;
         let cube = (-side..=side).flat_map(|z| {
             (-side..=side).flat_map(move |y| (-side..=side).map(move |x| I64Vec3::new(x, y, z)))
         });
-        let ball: Vec<I64Vec3> = cube.filter(|offset| offset.as_vec3().length() <= reach).collect();
-        let steps: Vec<isize> = ball.iter().map(|offset| self.step(*offset)).collect();
+        let ball: Vec<(I64Vec3, isize, u8)> = cube
+            .filter(|offset| offset.as_vec3().length() <= reach)
+            .map(|offset| (offset, self.step(offset), offset.length_squared() as u8))
+            .collect();
         let strides = self.strides();
         let counts = self.counts.as_i64vec3();
-        let mut spread = marked.to_vec();
+        let mut distances: Vec<u8> = marked.iter().map(|marked| if *marked { 0 } else { FAR }).collect();
         for row in (0..marked.len()).filter(|row| marked[*row]) {
             if !self.on_border(row) && strides.iter().all(|step| marked[row - step] && marked[row + step]) {
                 continue;
             }
             let at = self.at(row).as_i64vec3();
             let within = (at - side).min_element() >= 0 && (at + side).cmplt(counts).all();
-            for (offset, step) in ball.iter().zip(&steps) {
+            for (offset, step, distance) in &ball {
                 let to = at + *offset;
                 if within || (to.min_element() >= 0 && to.cmplt(counts).all()) {
-                    spread[row.wrapping_add_signed(*step)] = true;
+                    let found = &mut distances[row.wrapping_add_signed(*step)];
+                    *found = (*found).min(*distance);
                 }
             }
         }
-        spread
+        distances
     }
 }
 
@@ -139,10 +154,10 @@ mod tests {
     #[test]
     fn narrow_tunnels_are_closed_by_walls_and_wide_ones_stay() {
         let cell = 2.0 / 80.0;
-        // A plate with round holes of these radii in cubes.
-        let plate = |radii: &[f32]| {
+        // A plate of this half thickness with round holes of these radii in cubes.
+        let plate_of = |thickness: f32, radii: &[f32]| {
             grid(81, |p| {
-                let plate = ((p.abs() - Vec3::new(0.8, 0.8, 0.2)) / cell).max_element();
+                let plate = ((p.abs() - Vec3::new(0.8, 0.8, thickness * cell)) / cell).max_element();
                 let holes = radii.iter().enumerate().map(|(i, radius)| {
                     let middle = Vec2::new(-0.5 + 0.5 * i as f32, 0.1);
                     radius - p.truncate().distance(middle) / cell
@@ -150,6 +165,7 @@ mod tests {
                 cell * holes.fold(plate, f32::max)
             })
         };
+        let plate = |radii: &[f32]| plate_of(8.0, radii);
         let mut narrow = plate(&[1.2, 2.0]);
         let before = handles(&narrow);
         narrow.close_tunnels();
@@ -158,6 +174,10 @@ mod tests {
         // Walls are thin.
         let whole = handles(&plate(&[])).1;
         assert!(after.1 < before.1 + 0.5 * (whole - before.1));
+        // A ball that touches the edge of a hole in a thin plate does not reach into the hole.
+        let mut thin = plate_of(1.1, &[2.0, 3.0]);
+        thin.close_tunnels();
+        assert_eq!(handles(&thin).0, 0);
         let mut wide = plate(&[6.0, 8.0]);
         let values = wide.values.clone();
         wide.close_tunnels();
