@@ -12,7 +12,7 @@ use super::grid::{Grid, STEPS};
 const WIDEST: f32 = 8.0;
 
 /// Above the squares of all distances up to half of [`WIDEST`].
-const FAR: u8 = 17;
+const FAR: u8 = (0.25 * WIDEST * WIDEST) as u8 + 1;
 
 /// The 14 corners that share an edge with a corner: their offsets, and bit sets of their neighbours among the 14. The
 /// edges are the edges of Kuhn's subdivision, in which corners that are neighbours in pairs form a simplex.
