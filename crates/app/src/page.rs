@@ -7,7 +7,7 @@ use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 
 use clap::Args;
 use snapsnap_base::FileError;
-use ureq::http::StatusCode;
+use http::StatusCode;
 
 use crate::failure::Failure;
 use crate::server::{Answer, Body, Content, Refusal, Request, serve};

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use ureq::http::StatusCode;
+use http::StatusCode;
 
 /// Largest number of simultaneous connections. Further ones are closed.
 const CONNECTIONS: usize = 64;

@@ -49,32 +49,48 @@ impl Build {
 pub struct Pose {
     /// Trunk: lean forwards, turn, lean aside.
     pub trunk: [f32; 3],
+    /// Forward bends of pelvis, shoulders and neck beside a straight back: lordosis, kyphosis, head forward.
+    pub spine: [f32; 3],
     /// Head: nod, turn, tilt.
     pub head: [f32; 3],
     /// Arms: raised aside, raised forwards, turned inwards; bend of the elbow.
     pub arms: [[f32; 4]; 2],
     /// Legs: raised forwards, raised aside; bend of the knee.
     pub legs: [[f32; 3]; 2],
+    /// Toes: turned outwards, beside 9°.
+    pub toes: [f32; 2],
     /// Curl of the fingers.
     pub fingers: f32,
 }
 
 /// Share of people who walk.
 const WALKING: f32 = 0.17;
+/// Share of people with both knees bent.
+const BENT: f32 = 0.15;
 /// Kinds of poses of an arm: the share of arms up to each kind, and the ranges of [`Pose::arms`].
-const ARMS: [(f32, [(f32, f32); 4]); 7] = [
+const ARMS: [(f32, [(f32, f32); 4]); 12] = [
     // Close to the body.
-    (0.2, [(4.0, 12.0), (-8.0, 10.0), (-5.0, 25.0), (3.0, 22.0)]),
+    (0.18, [(4.0, 12.0), (-8.0, 10.0), (-5.0, 25.0), (3.0, 22.0)]),
     // A little away.
-    (0.4, [(10.0, 25.0), (-8.0, 12.0), (-5.0, 25.0), (3.0, 30.0)]),
+    (0.34, [(10.0, 25.0), (-8.0, 12.0), (-5.0, 25.0), (3.0, 30.0)]),
     // Farther away.
-    (0.53, [(25.0, 55.0), (-8.0, 8.0), (-10.0, 20.0), (2.0, 20.0)]),
+    (0.44, [(25.0, 55.0), (-8.0, 8.0), (-10.0, 20.0), (2.0, 20.0)]),
     // About level.
-    (0.62, [(70.0, 95.0), (-8.0, 8.0), (-10.0, 20.0), (0.0, 12.0)]),
+    (0.48, [(70.0, 95.0), (-8.0, 8.0), (-10.0, 20.0), (0.0, 12.0)]),
+    // Raised.
+    (0.52, [(115.0, 165.0), (-10.0, 10.0), (-20.0, 20.0), (0.0, 60.0)]),
     // On the hip.
-    (0.76, [(42.0, 52.0), (-22.0, -12.0), (78.0, 95.0), (88.0, 102.0)]),
+    (0.62, [(42.0, 52.0), (-22.0, -12.0), (78.0, 95.0), (88.0, 102.0)]),
     // In the pocket.
-    (0.86, [(14.0, 24.0), (-26.0, -12.0), (15.0, 40.0), (30.0, 52.0)]),
+    (0.7, [(14.0, 24.0), (-26.0, -12.0), (15.0, 40.0), (30.0, 52.0)]),
+    // The hand before the hips.
+    (0.76, [(8.0, 16.0), (5.0, 20.0), (45.0, 65.0), (35.0, 60.0)]),
+    // The hand raised before the body, as with a phone.
+    (0.83, [(5.0, 20.0), (0.0, 30.0), (5.0, 45.0), (80.0, 130.0)]),
+    // Across the chest.
+    (0.87, [(8.0, 18.0), (20.0, 42.0), (65.0, 85.0), (92.0, 112.0)]),
+    // The hand behind the hips.
+    (0.91, [(10.0, 20.0), (-38.0, -24.0), (70.0, 95.0), (25.0, 55.0)]),
     // Anywhere.
     (1.0, [(12.0, 110.0), (-15.0, 60.0), (-10.0, 60.0), (5.0, 95.0)]),
 ];
@@ -82,21 +98,28 @@ const ARMS: [(f32, [(f32, f32); 4]); 7] = [
 impl Pose {
     pub fn draw(random: &mut impl Rng) -> Self {
         let mut between = |low: f32, high: f32| random.random_range(low..high);
+        // Hips before (negative) or behind the ankles, up to 10 cm. The trunk leans to the other side.
+        let sway = between(-6.5, 4.0);
+        let (lordosis, kyphosis) = (between(-8.0, 12.0), between(-8.0, 14.0));
         let mut pose = Self {
-            trunk: [between(-4.0, 8.0), between(-10.0, 10.0), between(-4.0, 4.0)],
+            trunk: [between(-4.0, 8.0) + between(0.0, 1.0) * sway, between(-10.0, 10.0), between(-4.0, 4.0)],
+            spine: [lordosis, kyphosis, between(-6.0, 20.0)],
             head: [between(-8.0, 14.0), between(-30.0, 30.0), between(-8.0, 8.0)],
             fingers: between(5.0, 35.0),
             ..Self::default()
         };
-        let stance = between(0.0, 12.0);
-        for leg in &mut pose.legs {
-            *leg = [between(-3.0, 6.0), stance + between(-1.0, 1.0), between(0.0, 8.0)];
+        let (stance, out) = (between(0.0, 12.0), between(-10.0, 16.0));
+        let bent = if between(0.0, 1.0) < BENT { between(6.0, 24.0) } else { 0.0 };
+        for (leg, toes) in pose.legs.iter_mut().zip(&mut pose.toes) {
+            let knee = bent + between(0.0, 8.0);
+            *leg = [sway + 0.5 * knee + between(-3.0, 3.0), stance + between(-1.0, 1.0), knee];
+            *toes = out + between(-6.0, 6.0);
         }
         // The weight on one leg, the other a little forwards and bent.
         if between(0.0, 1.0) < 0.3 {
             let free = usize::from(between(0.0, 1.0) < 0.5);
             pose.legs[free] = [between(6.0, 20.0), between(2.0, 14.0), between(8.0, 30.0)];
-            pose.legs[1 - free] = [between(-4.0, 1.0), between(-2.0, 3.0), between(0.0, 3.0)];
+            pose.legs[1 - free] = [sway + between(-1.0, 2.0), between(-2.0, 3.0), between(0.0, 3.0)];
             pose.trunk[2] = sign(free) * between(0.0, 6.0);
         }
         let swing = if between(0.0, 1.0) < 0.5 { 1.0 } else { -1.0 };
@@ -113,7 +136,7 @@ impl Pose {
                 let raise = -across * between(15.0, 32.0);
                 pose.arms[side] = [between(9.0, 14.0), raise, between(0.0, 15.0), between(10.0, 40.0)];
             }
-            return pose;
+            return pose.hung();
         }
         // Both arms have the same kind of pose, or each has its own.
         let kind = between(0.0, 1.0);
@@ -123,20 +146,40 @@ impl Pose {
             let (_, ranges) = ARMS.into_iter().find(|(share, _)| kind < *share).expect("kinds are below 1");
             *arm = ranges.map(|(low, high)| between(low, high));
         }
-        pose
+        pose.hung()
+    }
+
+    /// The pose with limbs that hang down from a bent spine as they do from a straight one.
+    fn hung(mut self) -> Self {
+        let [lordosis, kyphosis, _] = self.spine;
+        self.legs.iter_mut().for_each(|leg| leg[0] += lordosis);
+        self.arms.iter_mut().for_each(|arm| arm[1] += 0.7 * kyphosis);
+        self
     }
 
     /// Axes of the trunk, from the pelvis (0) to the shoulders (1).
     pub fn trunk_frame(&self, share: f32) -> Mat3 {
-        let [lean, turn, aside] = self.trunk;
-        rotate_y((0.3 + 0.4 * share) * turn) * rotate_x((0.3 + 0.7 * share) * lean) * rotate_z(share * aside)
+        /// Share of the waist, which bends backwards where pelvis and shoulders bend forwards.
+        const WAIST: f32 = 0.45;
+        let ([lean, turn, aside], [lordosis, kyphosis, _]) = (self.trunk, self.spine);
+        let waist = -0.5 * (lordosis + kyphosis);
+        let bend = if share < WAIST {
+            lordosis + (waist - lordosis) * share / WAIST
+        } else {
+            waist + (kyphosis - waist) * (share - WAIST) / (1.0 - WAIST)
+        };
+        let lean = (0.3 + 0.7 * share) * lean + bend;
+        rotate_y((0.3 + 0.4 * share) * turn) * rotate_x(lean) * rotate_z(share * aside)
     }
 
     /// Axes of neck and head, from the shoulders (0) to the skull (1).
     pub fn head_frame(&self, share: f32) -> Mat3 {
         let [nod, look, tilt] = self.head;
-        let upright = nod - 0.5 * self.trunk[0];
-        self.trunk_frame(1.0) * rotate_y(share * look) * rotate_x(share * upright) * rotate_z(share * tilt)
+        let [_, kyphosis, forward] = self.spine;
+        let upright = nod - 0.5 * self.trunk[0] - kyphosis;
+        // The neck leans forwards, the skull does not.
+        let bend = share * upright + 4.0 * share * (1.0 - share) * forward;
+        self.trunk_frame(1.0) * rotate_y(share * look) * rotate_x(bend) * rotate_z(share * tilt)
     }
 
     /// Degrees that an arm is raised aside beyond 35, where the collarbone begins to move.
@@ -242,7 +285,7 @@ impl Figure {
         let (pelvis_frame, chest_frame) = (pose.trunk_frame(0.0), pose.trunk_frame(1.0));
         let pelvis = Bone::stand(Vec3::ZERO, pelvis_frame, 0.095 * h);
         let chest = Bone::stand(pelvis.end, chest_frame, 0.215 * h);
-        let neck = Bone::stand(chest.end, chest_frame * rotate_x(0.4 * pose.head[0] + 8.0), 0.045 * h);
+        let neck = Bone::stand(chest.end, chest_frame * rotate_x(0.4 * pose.head[0] + pose.spine[2] + 8.0), 0.045 * h);
         let head = Bone::stand(neck.end, pose.head_frame(1.0), 0.128 * h * build.head);
 
         let breadth = h * build.shoulders * (0.09 + 0.015 * build.sex);
@@ -269,7 +312,8 @@ impl Figure {
         let thighs = sides.map(|side| {
             let [forward, apart, _] = pose.legs[side];
             let start = pelvis.at(0.0, Vec3::new(sign(side) * 0.051 * h, -0.005 * h, 0.0));
-            let frame = pelvis_frame * rotate_x(-forward) * rotate_z(sign(side) * apart);
+            let out = sign(side) * 0.5 * pose.toes[side];
+            let frame = pelvis_frame * rotate_x(-forward) * rotate_z(sign(side) * apart) * rotate_y(out);
             Bone::hang(start, frame, 0.245 * h * build.legs)
         });
         let calves = sides.map(|side| {
@@ -280,7 +324,7 @@ impl Figure {
             // Feet stay flat. The heel lifts only if the calf leans far forwards.
             let calf = calves[side].frame;
             let lifted = (calf.y_axis.z.clamp(-1.0, 1.0) * 45.0 - 6.0).max(0.0);
-            let out = sign(side) * 9.0;
+            let out = sign(side) * (9.0 + pose.toes[side]);
             let frame = rotate_y(0.3 * turn + out) * rotate_x(lifted);
             Bone::hang(calves[side].end, frame, 0.039 * h)
         });

@@ -269,12 +269,13 @@ impl Pose {
     /// The pose with left and right exchanged.
     fn mirrored(self) -> Self {
         let ([lean, turn, aside], [nod, look, tilt]) = (self.trunk, self.head);
-        let ([left, right], [a, b]) = (self.arms, self.legs);
+        let ([left, right], [a, b], [c, d]) = (self.arms, self.legs, self.toes);
         Self {
             trunk: [lean, -turn, -aside],
             head: [nod, -look, -tilt],
             arms: [right, left],
             legs: [b, a],
+            toes: [d, c],
             ..self
         }
     }
@@ -327,6 +328,8 @@ mod tests {
             let mut pose = Pose::draw(&mut random);
             // Beyond 80°, an arm has two descriptions.
             pose.arms.iter_mut().for_each(|arm| arm[0] = arm[0].min(80.0));
+            // Files tell the trunk's ends alone.
+            pose.spine = [0.0; 3];
             let figure = Figure::new(build.clone(), &pose);
             let found = parse(&bvh(&figure)).expect("reads").remove(0);
             let again = Figure::new(build.clone(), &found);

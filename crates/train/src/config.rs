@@ -99,11 +99,6 @@ pub struct Stage2Config {
     pub curriculum: bool,
     /// Weight of the mean absolute difference of coverage and mask.
     pub alpha_weight: f64,
-    /// Weight of the anisotropy penalty: the logarithm of a Gaussian's ratio of axes, longest to shortest, above
-    /// `anisotropy_limit`.
-    pub anisotropy_weight: f64,
-    /// Largest ratio of the longest to the shortest axis without a penalty.
-    pub anisotropy_limit: f64,
     /// Weight of stage 1's loss while the point predictor is trained as well; 0: it is frozen.
     pub points_weight: f64,
 }
@@ -132,8 +127,6 @@ impl Default for Stage2Config {
         Self {
             curriculum: false,
             alpha_weight: 0.0,
-            anisotropy_weight: 0.0,
-            anisotropy_limit: 8.0,
             points_weight: 0.0,
         }
     }
@@ -180,8 +173,6 @@ impl TrainConfig {
             ("training.ema_decay", t.ema_decay, 0.0..=0.999_999),
             ("stage1.relief_weight", self.stage1.relief_weight, 0.0..=1e6),
             ("stage2.alpha_weight", two.alpha_weight, 0.0..=1e6),
-            ("stage2.anisotropy_weight", two.anisotropy_weight, 0.0..=1e6),
-            ("stage2.anisotropy_limit", two.anisotropy_limit, 1.0..=1e6),
             ("stage2.points_weight", two.points_weight, 0.0..=1e6),
         ];
         if let Some((key, message)) = outside(ranges) {

@@ -39,12 +39,11 @@ fn aligned_models_have_smaller_errors_and_the_report_says_how_they_moved() {
 fn a_report_has_its_keys_and_follows_from_its_tables() {
     let temporary = tempfile::tempdir().expect("a folder");
     let report = temporary.path().join("new/report");
-    let mean = format!("baselines.mean=[{:?}]", people().display().to_string());
     let other = weights(2).display().to_string();
     let groups = "groups.loose.subjects=[\"0001\"]";
     let ablation = "ablations.sideless.sides=false";
     let arguments =
-        ["--set", mean.as_str(), "--against", &other, "--set", groups, "--set", "views.turns=[0, 3]"];
+        ["--against", &other, "--set", groups, "--set", "views.turns=[0, 3]"];
     succeed(evaluate(people(), &report, &arguments).args(["--set", ablation]));
     let found = json(&report);
     for key in
@@ -103,7 +102,7 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
                 assert!(low <= mean_of && mean_of <= high, "{contestant}: {low} {mean_of} {high}");
             };
             check(&of["overall"], "model");
-            for baseline in ["billboard", "true_points", "mean_picture"] {
+            for baseline in ["billboard", "true_points"] {
                 check(&found["baselines"][baseline][protocol], baseline);
             }
             for other in ["against", "sideless"] {

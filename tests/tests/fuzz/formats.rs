@@ -73,10 +73,9 @@ fn rehearse(name: &'static str, arguments: &str) -> Format {
 pub fn all() -> Vec<Format> {
     let masked = "in/a.jpg in/progressive.jpg --masks in/m.png in/m.jpg";
     let model = "--weights in/w.safetensors --device cpu -o out";
-    let evaluate = "evaluate --config in/e.toml --data in/people --set baselines.mean=[\"in/others\"]";
+    let evaluate = "evaluate --config in/e.toml --data in/people";
     let meshes = "--mesh-dir in/scans --align similarity --set data.scans=in/scans -o out";
     let bench = "bench --config in/b.toml --data in/people --set bench.resolution=32 --quick";
-    // Of training people, only pictures are read.
     let evaluated = "e.toml dataset.toml a/1.png a/2.png test/depth/a/1.npz test/cameras/a.json";
     let body = "base.obj .mhskel .mhw .target .mhclo worn.obj .bvh";
     vec![

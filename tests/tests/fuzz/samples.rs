@@ -114,10 +114,7 @@ pub fn make(folder: &Path, name: &str) {
                 include_str!("../../../configs/bench.toml").split_once("[settings").expect("settings");
             put(&path, [general, SETTING].concat());
         }
-        "people" => {
-            prepare(folder, "test", 4, "people");
-            prepare(folder, "train", 4, "others");
-        }
+        "people" => prepare(folder, "test", 4, "people"),
         "h.ply" => put(&path, ply_bytes(&cloud(3, 0), Format::Little, "", b"")),
         "ascii.ply" => put(&path, ply_bytes(&cloud(2, 1), Format::Ascii, EDGE, b"2 0 1\n")),
         "big_endian.ply" => put(&path, ply_bytes(&cloud(2, 2), Format::Big, EDGE, &[2, 0, 1])),

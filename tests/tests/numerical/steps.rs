@@ -27,13 +27,11 @@ use snapsnap_train::task::{Moment, Task};
 
 fn config() -> TrainConfig {
     // The smaller network size includes interpolation. Confidences of random weights are near ½.
-    const OTHER: [&str; 6] = [
+    const OTHER: [&str; 4] = [
         "network.net_resolution=32",
         "network.conf_threshold=0.4",
         "training.validation_samples=0",
         "training.seed=1",
-        "stage2.anisotropy_weight=0.1",
-        "stage2.anisotropy_limit=1.5",
     ];
     TrainConfig::from_toml(TRAINING, "the tests' config", &OTHER.map(String::from)).expect("a config")
 }
@@ -313,7 +311,4 @@ fn gradients_of_the_losses_are_finite_differences() {
         l1 * 0.8 + (1.0 - ssim) * 0.2
     };
     check("photometric", &random(&[1, 2, 13, 12], 0.0..1.0, 5), [1, 2, 13, 12], photometric);
-
-    let needle = |scales: Tensor<2>| stage2::anisotropy_penalty(&scales, 2.0);
-    check("needles", &random(&[6, 3], 0.01..1.0, 6), [6, 3], needle);
 }

@@ -29,7 +29,7 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     wrong(&["--set", "samples.placed_share=2"], &["samples.placed_share"]);
     wrong(&["--set", "network.resolution=128", "--set", "network.net_resolution=128"], &["64", "128"]);
     wrong(&["--set", "network.conf_mode=exp"], &["conf_mode", "sigmoid"]);
-    wrong(&["--set", "stage2.anisotropy_limit=0.5"], &["stage2.anisotropy_limit"]);
+    wrong(&["--set", "stage2.alpha_weight=-0.5"], &["stage2.alpha_weight"]);
     wrong(&["--set", "schedule.warm_up=1000000"], &["schedule.warm_up", "training.steps"]);
     wrong(&["--set", "network.delta=1e30"], &["network.delta", "1000000"]);
     wrong(&["--minutes", "0"], &["--minutes", "more than 0"]);

@@ -10,7 +10,6 @@ use clap::Args;
 use serde_json::Value;
 use snapsnap_base::config::Schema;
 use snapsnap_data::sample::PhotographChanges;
-use snapsnap_eval::evaluate::baselines::MeanPictures;
 use snapsnap_eval::evaluate::config::EvalConfig;
 use snapsnap_eval::evaluate::meshes::evaluate_meshes;
 use snapsnap_eval::evaluate::model::Model;
@@ -79,7 +78,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let config = config_of(arguments)?;
     let (sets, mut missing) = data_sets(&config)?;
     let roots = sets.iter().map(|set| set.folder.root());
-    outside_data(&arguments.output, roots.chain(config.baselines.mean.iter().map(PathBuf::as_path)))?;
+    outside_data(&arguments.output, roots)?;
     if let Some(meshes) = &arguments.mesh_dir {
         return judge_meshes(arguments, &config, &sets, meshes, missing);
     }
@@ -96,7 +95,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         .map(PathBuf::as_path)
         .collect();
     let lpips = arguments.lpips.load(&config.metrics.lpips, &names[0])?;
-    let contestants = contestants(&config, &sets, &variants, &devices[0], &mut missing);
+    let contestants = contestants(&config, &variants, &devices[0], &mut missing);
     if contestants.is_empty() {
         return Err(nothing_left("nothing is left to evaluate", &missing));
     }
@@ -234,7 +233,6 @@ pub(super) fn opened(variant: &Variant) -> Result<(WeightFile, Device), Failure>
 /// The model, its variants and the baselines. Contestants that cannot be loaded are added to `missing`.
 fn contestants(
     config: &EvalConfig,
-    sets: &[People],
     variants: &[(String, Variant)],
     device: &Device,
     missing: &mut Vec<LeftOut>,
@@ -254,12 +252,6 @@ fn contestants(
     }
     if config.baselines.true_points {
         contestants.push(Contestant::TruePoints(device.clone()));
-    }
-    if !config.baselines.mean.is_empty() {
-        match MeanPictures::new(&config.baselines.mean, sets) {
-            Ok(pictures) => contestants.push(Contestant::Mean(pictures)),
-            Err(e) => missing.push(LeftOut::new("mean_picture", e)),
-        }
     }
     contestants
 }

@@ -1,30 +1,27 @@
 //! `snapsnap fetch-weights`: downloads published weights and checks their SHA-256.
 
 use std::fs::{self, File, TryLockError};
-use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::io::{self, Read, Seek, Write};
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use snapsnap_base::{FileError, file};
 use snapsnap_eval::lpips;
-use ureq::Agent;
-use ureq::http::StatusCode;
 
 use crate::failure::{Failure, bail};
 use crate::output::make_folder;
-use crate::progress::Progress;
 use crate::say;
 use crate::weights::sha256;
 
 /// Attempts in a row without new bytes after which the download fails.
 const ATTEMPTS: u32 = 4;
-/// Time limits of the first and of the longest attempt. The limit doubles after an attempt that brought new bytes.
-const ATTEMPT: [Duration; 2] = [Duration::from_secs(60), Duration::from_secs(20 * 60)];
-/// Time limit of the connection, and of the wait for a response.
-const SILENCE: Duration = Duration::from_secs(60);
-/// Bytes read at a time.
-const CHUNK: usize = 1 << 16;
+/// Exit codes of curl: the server does not send parts of files; the file is longer than the published one.
+const NO_RANGES: i32 = 33;
+const TOO_LONG: i32 = 63;
+/// An answer of the server that says no.
+const REFUSED: i32 = 22;
 
 #[derive(Args)]
 pub struct Arguments {
@@ -159,18 +156,14 @@ fn check_existing(item: &Item, path: &Path) -> Result<(), Failure> {
 /// Copies a file from a folder, whole or not at all.
 fn copy(item: &Item, folder: &Path, path: &Path) -> Result<(), Failure> {
     let from = folder.join(item.file);
-    let mut source = file::open(&from).map_err(FileError::read(&from))?;
-    let progress = Progress::bytes();
+    let source = file::open(&from).map_err(FileError::read(&from))?;
     let written = file::write_whole(path, |out| {
-        take(&mut source, out, 0, item, &progress)?;
+        // One byte too many shows that the file is another.
+        io::copy(&mut source.take(item.bytes + 1), out)?;
         out.flush()?;
         check_sum(item, &from.display().to_string(), out.get_mut())
     });
-    written.map_err(|e| match e {
-        Broken::Write(e) => Failure::cannot_write(path, &e),
-        Broken::Source(message) => Failure::file(&from, format!("cannot read: {message}")),
-        Broken::Refused(message) => Failure::Input(message),
-    })
+    written.map_err(|broken| broken.failure(path))
 }
 
 /// Downloads a file into `FILE.part`, which is renamed once its sum is right.
@@ -187,26 +180,17 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
     if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
         return Err(Failure::file(&part, "is being fetched by another process"));
     }
-    let filled = fill(&mut file, item, address, &Progress::bytes());
-    // A later attempt continues from what has arrived.
+    let filled = fill(&mut file, &part, item, address);
+    // A later run continues from what has arrived.
     if filled.is_err() && file.metadata().is_ok_and(|there| there.len() == 0) {
         let _ = fs::remove_file(&part);
     }
-    filled.map_err(|broken| match broken {
-        Broken::Write(e) => cannot_write(e),
-        Broken::Source(message) | Broken::Refused(message) => {
-            Failure::Internal(format!("{address}: {message}"))
-        }
+    filled?;
+    check_sum(item, address, &mut file).map_err(|broken| {
+        // A later run must not continue from wrong bytes.
+        let _ = fs::remove_file(&part);
+        broken.failure(&part)
     })?;
-    match check_sum(item, address, &mut file) {
-        Ok(()) => {}
-        Err(Broken::Write(e)) => return Err(cannot_write(e)),
-        Err(Broken::Source(message) | Broken::Refused(message)) => {
-            // A later attempt must not continue from wrong bytes.
-            let _ = fs::remove_file(&part);
-            return Err(Failure::Input(message));
-        }
-    }
     file::rename(&part, path).map_err(|e| Failure::cannot_write(path, &e))
 }
 
@@ -221,19 +205,24 @@ fn is_shared(_: &fs::Metadata) -> bool {
     false
 }
 
-/// Why bytes of a file could not be fetched.
+/// Why a file is not the published one.
 enum Broken {
-    /// The source broke off. Another attempt may succeed.
-    Source(String),
-    /// Every attempt will fail.
-    Refused(String),
-    /// The file cannot be written.
-    Write(io::Error),
+    Content(String),
+    File(io::Error),
+}
+
+impl Broken {
+    fn failure(self, path: &Path) -> Failure {
+        match self {
+            Self::Content(message) => Failure::Input(message),
+            Self::File(e) => Failure::cannot_write(path, &e),
+        }
+    }
 }
 
 impl From<io::Error> for Broken {
     fn from(e: io::Error) -> Self {
-        Self::Write(e)
+        Self::File(e)
     }
 }
 
@@ -244,105 +233,47 @@ fn check_sum(item: &Item, origin: &str, file: &mut File) -> Result<(), Broken> {
     if found == item.sha256 && length == item.bytes {
         return Ok(());
     }
-    Err(Broken::Refused(format!(
+    Err(Broken::Content(format!(
         "{origin}: the content is not that of {}: {length} bytes with SHA-256 {found}; nothing was kept",
         item.file
     )))
 }
 
-/// Copies until the source ends or there is one byte too many. `at` bytes are there already.
-fn take(
-    source: &mut dyn Read,
-    file: &mut dyn Write,
-    mut at: u64,
-    item: &Item,
-    progress: &Progress,
-) -> Result<(), Broken> {
-    let mut chunk = vec![0; CHUNK];
-    while at <= item.bytes {
-        let most = CHUNK.min((item.bytes + 1 - at) as usize);
-        let n = source.read(&mut chunk[..most]).map_err(|e| Broken::Source(e.to_string()))?;
-        if n == 0 {
-            break;
+/// Lets curl download the rest of an unfinished file, in several attempts if connections break.
+fn fill(file: &mut File, part: &Path, item: &Item, address: &str) -> Result<(), Failure> {
+    let cannot_write = |e: io::Error| Failure::cannot_write(part, &e);
+    let length = |file: &File| file.metadata().map(|there| there.len()).map_err(cannot_write);
+    if length(file)? > item.bytes {
+        file.set_len(0).map_err(cannot_write)?;
+    }
+    // Progress is counted from the largest length so far. Servers that restart the download make none.
+    let (mut fruitless, mut most) = (0, length(file)?);
+    while length(file)? < item.bytes {
+        let meter = if say::is_quiet() { "--no-progress-meter" } else { "--progress-bar" };
+        let limit = item.bytes.to_string();
+        let mut curl = Command::new("curl");
+        curl.args(["--fail", "--location", "--show-error", meter, "--connect-timeout", "60"]);
+        curl.args(["--speed-limit", "1", "--speed-time", "60", "--max-filesize", &limit, "--continue-at", "-"]);
+        curl.arg("--output").arg(part).args(["--", address]);
+        let ended = curl.stdin(Stdio::null()).stdout(Stdio::null()).status().map_err(|e| {
+            let advice = format!("fetch {address} by other means, and give its folder with --from");
+            Failure::Internal(format!("cannot run curl: {e}; install curl, or {advice}"))
+        })?;
+        let after = length(file)?;
+        if ended.code() == Some(NO_RANGES) || ended.code() == Some(TOO_LONG) {
+            file.set_len(0).map_err(cannot_write)?;
         }
-        file.write_all(&chunk[..n])?;
-        at += n as u64;
-        progress.advance(at, item.bytes);
+        if ended.code() == Some(TOO_LONG) {
+            let message = format!("the content is not that of {}: it is longer; nothing was kept", item.file);
+            return Err(Failure::Input(format!("{address}: {message}")));
+        }
+        fruitless = if after > most { 0 } else { fruitless + 1 };
+        most = most.max(after);
+        if after < item.bytes && (fruitless == ATTEMPTS || ended.code() == Some(REFUSED)) {
+            let kept = format!("{after} of {} bytes are kept; the next run continues from there", item.bytes);
+            return Err(Failure::Internal(format!("{address}: the download ended early; {kept}")));
+        }
+        std::thread::sleep(Duration::from_millis(if fruitless > 0 { 200 << fruitless } else { 0 }));
     }
     Ok(())
-}
-
-/// Downloads the rest of an unfinished file, in several attempts if connections break.
-fn fill(file: &mut File, item: &Item, address: &str, progress: &Progress) -> Result<(), Broken> {
-    // Progress is counted from the largest length so far. Servers that restart the download make none.
-    let (mut fruitless, mut most, mut time) = (0, 0, ATTEMPT[0]);
-    loop {
-        let before = file.seek(SeekFrom::End(0))?;
-        if before == item.bytes {
-            return Ok(());
-        }
-        if before > item.bytes {
-            file.set_len(0)?;
-            continue;
-        }
-        most = most.max(before);
-        let why = match attempt(time, address, file, before, item, progress) {
-            Ok(()) => "the connection ended early".to_owned(),
-            Err(Broken::Source(message)) => message,
-            Err(broken) => return Err(broken),
-        };
-        let after = file.metadata()?.len();
-        if after >= item.bytes {
-            return Ok(());
-        }
-        (fruitless, time) =
-            if after > most { (0, ATTEMPT[1].min(2 * time)) } else { (fruitless + 1, ATTEMPT[0]) };
-        if fruitless == ATTEMPTS {
-            let kept =
-                format!("{after} of {} bytes are kept; the next attempt continues from there", item.bytes);
-            return Err(Broken::Source(format!("{why}; {kept}")));
-        }
-        std::thread::sleep(Duration::from_millis(200 << fruitless));
-    }
-}
-
-/// Requests the bytes from `from` on and appends them to the file.
-fn attempt(
-    time: Duration,
-    address: &str,
-    file: &mut File,
-    from: u64,
-    item: &Item,
-    progress: &Progress,
-) -> Result<(), Broken> {
-    let config = Agent::config_builder()
-        .timeout_connect(Some(SILENCE))
-        .timeout_recv_response(Some(SILENCE))
-        .timeout_recv_body(Some(time))
-        .http_status_as_error(false);
-    let mut request = Agent::from(config.build()).get(address);
-    if from > 0 {
-        request = request.header("Range", format!("bytes={from}-"));
-    }
-    let mut answer = request.call().map_err(|e| Broken::Source(e.to_string()))?;
-    let status = answer.status();
-    let range = answer.headers().get("content-range").and_then(|range| range.to_str().ok());
-    let continues = range.is_some_and(|range| range.starts_with(&format!("bytes {from}-")));
-    let from = match status {
-        StatusCode::PARTIAL_CONTENT if continues => from,
-        // The server does not support ranges and sends the whole file.
-        StatusCode::OK => 0,
-        StatusCode::PARTIAL_CONTENT | StatusCode::RANGE_NOT_SATISFIABLE => {
-            file.set_len(0)?;
-            return Err(Broken::Source(format!("the server answers with another range than {from}-")));
-        }
-        _ if status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS => {
-            return Err(Broken::Source(format!("the server answers {status}")));
-        }
-        _ => return Err(Broken::Refused(format!("the server answers {status}"))),
-    };
-    file.set_len(from)?;
-    file.seek(SeekFrom::Start(from))?;
-    let mut body = answer.body_mut().with_config().limit(u64::MAX).reader();
-    take(&mut body, file, from, item, progress)
 }

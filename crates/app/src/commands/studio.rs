@@ -17,7 +17,7 @@ use snapsnap_mesh::picture;
 use snapsnap_net::Reconstructor;
 use snapsnap_photo::{Content, Cutting, Doubt, Figure, Joint, Sign, Source, Told, cut_out, person};
 use snapsnap_splat::scene::Stored;
-use ureq::http::StatusCode;
+use http::StatusCode;
 
 use crate::downloads::{self, Download};
 use crate::failure::Failure;

@@ -8,7 +8,7 @@ use std::time::SystemTime;
 
 use clap::Args;
 use snapsnap_base::FileError;
-use ureq::http::StatusCode;
+use http::StatusCode;
 
 use super::convert::{drawable, read};
 use crate::downloads::{self, Download};

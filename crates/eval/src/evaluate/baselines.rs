@@ -1,25 +1,12 @@
-//! Baselines of an evaluation: flat cut-outs, ground-truth points, mean pictures (docs/method.md, "Evaluation").
-
-use std::path::PathBuf;
-use std::sync::Arc;
+//! Baselines of an evaluation: flat cut-outs and ground-truth points (docs/method.md, "Evaluation").
 
 use burn::tensor::Device;
 use glam::{DVec2, DVec3};
-use rayon::prelude::*;
-use snapsnap_data::dataset::{Arrangement, Folder, Split};
 use snapsnap_net::config::Config;
 use snapsnap_net::network::View;
 use snapsnap_net::painter::{CanvasView, geometric, side_images};
 use snapsnap_net::placed;
-use snapsnap_ops::{bilinear, host};
 use snapsnap_splat::{Camera, Gaussians};
-
-use super::person::{People, part_of, planes, smaller, test_of};
-use crate::EvalError;
-use crate::pictures::Picture;
-
-/// Largest side of mean pictures in pixels. Mean pictures are smooth.
-const MEAN_SIDE: usize = 256;
 
 /// Gaussians (world frame) of photographs `[3,S,S]` in [−1, 1] as flat cut-outs. Each cut-out stands in the upright
 /// plane through the body's axis that faces its camera. `valid` `[S,S]` are the person's masks.
@@ -77,75 +64,6 @@ pub fn true_points(
 
 fn in_world(gaussians: Gaussians, camera: &Camera) -> Gaussians {
     placed(&Config::default(), gaussians, &camera.world_to_camera.inverse())
-}
-
-/// For each view, the mean picture of training people.
-pub struct MeanPictures {
-    side: usize,
-    /// `[3,S,S]` of each view.
-    views: Vec<Vec<f32>>,
-}
-
-impl MeanPictures {
-    /// Mean pictures of the training people of data sets that have the same views as the people to evaluate.
-    ///
-    /// # Errors
-    /// [`EvalError`] if the data sets differ in views or sizes, or if a picture cannot be read.
-    pub fn new(folders: &[PathBuf], evaluated: &[People]) -> Result<Self, EvalError> {
-        let views = evaluated.first().map_or(0, People::views);
-        if let Some(set) = evaluated.iter().find(|set| set.views() != views) {
-            let (root, found) = (set.folder.root().display(), set.views());
-            let message = format!(
-                "{root} has {found} views, the data set before it {views}: mean pictures need equal views"
-            );
-            return Err(EvalError::Message(message));
-        }
-        let mut sums: Vec<Vec<f64>> = Vec::new();
-        let (mut side, mut people) = (0, 0);
-        for path in folders {
-            let folder = Arc::new(Folder::open(path)?);
-            let found = folder.description().views;
-            let wrong = |message: &str| EvalError::Message(format!("{}: {message}", path.display()));
-            if found != views {
-                return Err(wrong(&format!("has {found} views, the people to evaluate {views}")));
-            }
-            if folder.description().arrangement != Arrangement::Ring {
-                return Err(wrong("is arranged in groups: mean pictures need a ring of views"));
-            }
-            let stored = folder.description().resolution as usize;
-            let kept = part_of(stored, MEAN_SIDE);
-            if side != 0 && kept != side {
-                return Err(wrong(&format!("has pictures of {kept}², the sets before it of {side}²")));
-            }
-            side = kept;
-            // Sums get their size from the first picture, not from the description of the data set.
-            sums.resize(views, Vec::new());
-            let test = test_of(&folder, Some(Split::Train))?;
-            // Each view sums its people in their order, so that the result does not depend on the number of threads.
-            sums.par_iter_mut().enumerate().try_for_each(|(view, sum)| -> Result<(), EvalError> {
-                for row in 0..test.count() {
-                    let (values, _) = test.target(row, view, [0.0; 3])?;
-                    let planes = smaller(values, 3, stored, side);
-                    sum.resize(planes.len(), 0.0);
-                    sum.iter_mut().zip(planes).for_each(|(sum, v)| *sum += f64::from(v));
-                }
-                Ok(())
-            })?;
-            people += test.count();
-        }
-        let mean = |sum: Vec<f64>| sum.into_iter().map(|v| (v / people as f64) as f32).collect();
-        Ok(Self { side, views: sums.into_iter().map(mean).collect() })
-    }
-
-    /// The mean picture of a view at a size.
-    ///
-    /// # Errors
-    /// Errors of [`Picture::new`]. Means of pictures cause none.
-    pub fn picture(&self, view: usize, side: usize) -> Result<Picture, EvalError> {
-        let planes = planes(self.views[view].clone(), 3, self.side);
-        let planes = if side == self.side { planes } else { bilinear(planes, [side, side], false) };
-        Picture::new(host(planes.clamp(0.0, 1.0)), [side, side], "mean picture")
-    }
 }
 
 #[cfg(test)]

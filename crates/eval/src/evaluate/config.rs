@@ -214,14 +214,11 @@ pub struct BaselineSection {
     pub billboard: bool,
     /// Ground-truth points in the photographs' colours: the best input of a regressor.
     pub true_points: bool,
-    /// Data sets of training people with the same views, of any size. The baseline is the mean picture of each view.
-    /// Empty: left out.
-    pub mean: Vec<PathBuf>,
 }
 
 impl Default for BaselineSection {
     fn default() -> Self {
-        Self { billboard: true, true_points: true, mean: Vec::new() }
+        Self { billboard: true, true_points: true }
     }
 }
 
@@ -280,7 +277,7 @@ impl Schema for EvalConfig {
 impl EvalConfig {
     fn problem(&self) -> Option<(&'static str, String)> {
         /// Names that have another meaning in reports.
-        const TAKEN: [&str; 5] = ["model", "against", "billboard", "true_points", "mean_picture"];
+        const TAKEN: [&str; 4] = ["model", "against", "billboard", "true_points"];
         let Self { views, metrics, report, ablations, model, .. } = self;
         let devices = model.devices.iter().map(|name| on_device(name));
         let mut names: Vec<String> = ablations.keys().cloned().chain(devices).collect();

@@ -8,7 +8,7 @@ use snapsnap_net::Photograph;
 use snapsnap_photo::joints_on;
 use snapsnap_splat::{Camera, Gaussians};
 
-use super::baselines::{MeanPictures, billboard, true_points};
+use super::baselines::{billboard, true_points};
 use super::config::{MetricsSection, ViewsSection};
 use super::model::{Model, no_gaussian};
 use super::person::{People, Points, nearest_view, photograph, points};
@@ -45,8 +45,6 @@ pub enum Contestant {
     Billboard(Device),
     /// Ground-truth points in the photographs' colours.
     TruePoints(Device),
-    /// Mean pictures of training people.
-    Mean(MeanPictures),
 }
 
 /// Errors of a person's points in each view, and on the parts of the photographs.
@@ -54,8 +52,8 @@ pub type PointErrors = (Vec<PointError>, Vec<PartError>);
 
 /// A contestant's result for a person.
 pub struct Shown {
-    /// World frame; `None` for pictures alone.
-    pub gaussians: Option<Gaussians>,
+    /// World frame.
+    pub gaussians: Gaussians,
     /// Errors of the predicted points, or why they could not be measured.
     pub points: Result<PointErrors, String>,
     /// Number of pixels and Gaussians that were not finite.
@@ -77,7 +75,6 @@ impl Contestant {
             Self::Model(name, ..) => name,
             Self::Billboard(_) => "billboard",
             Self::TruePoints(_) => "true_points",
-            Self::Mean(_) => "mean_picture",
         }
     }
 
@@ -105,17 +102,17 @@ impl Contestant {
         canvas: usize,
         (metrics, truth): (&MetricsSection, Option<&Truth>),
     ) -> Result<Shown, EvalError> {
-        let of = |gaussians| Shown {
-            gaussians,
-            points: Ok(PointErrors::default()),
-            lost: 0,
-            masks: None,
-            palette: None,
-            time: None,
-            aligned: None,
-        };
-        let plain = |gaussians: Gaussians| {
-            if gaussians.is_empty() { Err(no_gaussian()) } else { Ok(of(Some(gaussians))) }
+        let plain = |gaussians: Gaussians| match gaussians.is_empty() {
+            true => Err(no_gaussian()),
+            false => Ok(Shown {
+                gaussians,
+                points: Ok(PointErrors::default()),
+                lost: 0,
+                masks: None,
+                palette: None,
+                time: None,
+                aligned: None,
+            }),
         };
         match self {
             Self::Model(.., model) => {
@@ -168,7 +165,6 @@ impl Contestant {
                 let front = &item.cameras[inputs[0]];
                 plain(true_points(&photographs, &points, &valid, canvas, front, device))
             }
-            Self::Mean(_) => Ok(of(None)),
         }
     }
 
@@ -180,15 +176,10 @@ impl Contestant {
         &self,
         shown: &Shown,
         camera: &Camera,
-        view: usize,
         side: usize,
         views: &ViewsSection,
     ) -> Result<Picture, EvalError> {
-        match (&shown.gaussians, self) {
-            (Some(gaussians), _) => rendered(gaussians, camera, side, &self.views(views)),
-            (None, Self::Mean(pictures)) => pictures.picture(view, side),
-            (None, _) => Err(EvalError::Message("there is nothing to render".into())),
-        }
+        rendered(&shown.gaussians, camera, side, &self.views(views))
     }
 }
 

@@ -16,7 +16,6 @@ use std::time::Duration;
 use image::RgbImage;
 use rayon::prelude::*;
 use snapsnap_data::sample::{PhotographChanges, TestItem};
-use snapsnap_splat::Gaussians;
 
 use crate::EvalError;
 use crate::foreign::Traces;
@@ -209,8 +208,8 @@ impl Place<'_> {
         }
         let compare = |view: &usize| self.compare(&item, *view, &shown);
         // A GPU runs one task at a time.
-        let is_on_gpu = |gaussians: &Gaussians| gaussians.device().identity().is_some();
-        let any_on_gpu = shown.iter().flatten().filter_map(|made| made.gaussians.as_ref()).any(is_on_gpu);
+        let is_on_gpu = |made: &Shown| made.gaussians.device().identity().is_some();
+        let any_on_gpu = shown.iter().flatten().any(is_on_gpu);
         let times = contestants.iter().map(|contestant| contestant.views(&config.views).supersampling).max();
         let most = if any_on_gpu { 1 } else { at_once(side * times.unwrap_or(1)) };
         let found = compared.chunks(most).flat_map(|views| match views {
@@ -246,10 +245,10 @@ impl Place<'_> {
         }
         judged.masks.extend(made.masks.map(|overlap| (person, overlap)));
         judged.times.extend(made.time);
-        judged.gaussians.extend(made.gaussians.as_ref().map(Gaussians::len));
+        judged.gaussians.push(made.gaussians.len());
         judged.aligned.extend(made.aligned);
         let is_baseline = judged.kind == Kind::Baseline;
-        let Some((truth, gaussians)) = truth.zip(made.gaussians.as_ref()) else { return };
+        let (Some(truth), gaussians) = (truth, &made.gaussians) else { return };
         if config.metrics.geometry {
             let surface = Surface::of_gaussians(gaussians, truth, config.metrics.opaque);
             let surface = self.kept(outcome, &format!("{name}, geometry"), surface);
@@ -284,7 +283,7 @@ impl Place<'_> {
             let shown = shown.as_ref()?;
             let score = |image: &Picture, region| Score::new(image, &target, region, self.lpips);
             let judged = || {
-                let image = self.contestants[i].picture(shown, camera, view, side, &config.views)?;
+                let image = self.contestants[i].picture(shown, camera, side, &config.views)?;
                 let scores = regions.iter().map(|region| score(&image, region)).collect::<Result<_, _>>()?;
                 let palette = shown.palette.as_ref().zip(around.as_ref());
                 let traces = palette.map(|(palette, region)| palette.traces(&image, &target, &mask, region));
@@ -342,7 +341,7 @@ fn pictures(
     }
     for wanted in &config.report.degrees {
         let view = person::nearest_view(&item.cameras, inputs[0], *wanted);
-        let image = contestant.picture(&shown, &item.cameras[view], view, side, &config.views)?;
+        let image = contestant.picture(&shown, &item.cameras[view], side, &config.views)?;
         let (target, _) = people.target(row, view, side)?;
         let window = Region::paper(&target)?.window;
         let [image, target] = [image, target].map(|picture| picture.cropped(window));

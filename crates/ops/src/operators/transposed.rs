@@ -5,7 +5,7 @@ use pulp::{Simd, WithSimd};
 
 use crate::winograd::GROUP;
 use crate::winograd::planes::Planes;
-use crate::winograd::transforms::{Block, P, P2, POINTS, Q, Q2, SPAN, TILE};
+use crate::winograd::transforms::{Block, P, P2, POINTS, Q, Q2, SPAN, TILE, spread};
 
 /// A · d for four values d.
 #[inline(always)]
@@ -59,8 +59,7 @@ impl WithSimd for OutputGradients<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { source, block, stride, lines, out, sums } = self;
-        let (groups, vectors) = (source.groups(), GROUP / S::F32_LANES);
-        let length = block.columns * TILE * GROUP;
+        let (groups, length) = (source.groups(), block.columns * TILE * GROUP);
         let lines = &mut lines[..SPAN * length];
         for (group, tile_row) in (0..groups).flat_map(|group| (0..block.rows).map(move |row| (group, row))) {
             for (i, out) in lines.chunks_exact_mut(length).take(TILE).enumerate() {
@@ -74,42 +73,9 @@ impl WithSimd for OutputGradients<'_> {
                     *total += f64::from(sum);
                 }
             }
-            spread_rows(simd, lines);
-            for (y, line) in lines.chunks_exact(length).enumerate() {
-                let mut planes = out.chunks_exact_mut(stride * GROUP).skip(SPAN * y * groups + group);
-                let mut points: [&mut [[f32; GROUP]]; SPAN] = Default::default();
-                for (points, plane) in points.iter_mut().zip(planes.by_ref().step_by(groups)) {
-                    *points = &mut plane.as_chunks_mut().0[tile_row * block.columns..][..block.columns];
-                }
-                for (t, tile) in line.as_chunks::<{ TILE * GROUP }>().0.iter().enumerate() {
-                    let (tile, _) = S::as_simd_f32s(tile);
-                    for v in 0..vectors {
-                        let mut d = [simd.splat_f32s(0.0); TILE];
-                        for x in 0..TILE {
-                            d[x] = tile[x * vectors + v];
-                        }
-                        let d = gradient_points::<S>(simd, d);
-                        for x in 0..SPAN {
-                            S::as_mut_simd_f32s(&mut points[x][t]).0[v] = d[x];
-                        }
-                    }
-                }
-            }
+            let planes = out.chunks_exact_mut(stride * GROUP).skip(group).step_by(groups);
+            spread(simd, lines, block.columns, tile_row, planes, |d| gradient_points::<S>(simd, d));
         }
-    }
-}
-
-/// A · d for every column of four rows, in place: the six rows of `lines` are the result.
-#[inline(always)]
-fn spread_rows<S: Simd>(simd: S, lines: &mut [f32]) {
-    let (lines, _) = S::as_mut_simd_f32s(lines);
-    let length = lines.len() / SPAN;
-    let mut rows = lines.chunks_exact_mut(length);
-    let [Some(a), Some(b), Some(c), Some(d), Some(e), Some(f)] = [(); SPAN].map(|()| rows.next()) else {
-        return;
-    };
-    for i in 0..length {
-        [a[i], b[i], c[i], d[i], e[i], f[i]] = gradient_points::<S>(simd, [a[i], b[i], c[i], d[i]]);
     }
 }
 

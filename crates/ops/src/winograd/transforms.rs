@@ -154,8 +154,7 @@ impl WithSimd for Inputs<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { source, block, stride, lines, out } = self;
-        let (groups, vectors) = (source.groups(), GROUP / S::F32_LANES);
-        let length = lines.len() / SPAN;
+        let (groups, length) = (source.groups(), lines.len() / SPAN);
         // The input rows and columns of a tile begin one before its outputs.
         let first = (TILE * block.column) as isize - 1;
         for (group, tile_row) in (0..groups).flat_map(|group| (0..block.rows).map(move |row| (group, row))) {
@@ -163,44 +162,56 @@ impl WithSimd for Inputs<'_> {
                 let row = (TILE * (block.row + tile_row) + i).checked_sub(1);
                 source.read(group, row, first, out);
             }
-            mix_rows(simd, lines);
-            for (y, line) in lines.chunks_exact(length).enumerate() {
-                let mut planes = out.chunks_exact_mut(stride * GROUP).skip(SPAN * y * groups + group);
-                let mut points: [&mut [[f32; GROUP]]; SPAN] = Default::default();
-                for (points, plane) in points.iter_mut().zip(planes.by_ref().step_by(groups)) {
-                    *points = &mut plane.as_chunks_mut().0[tile_row * block.columns..][..block.columns];
-                }
-                for t in 0..block.columns {
-                    let tile: &[f32; SPAN * GROUP] =
-                        line[t * TILE * GROUP..].first_chunk().expect("six columns per tile");
-                    let (tile, _) = S::as_simd_f32s(tile);
-                    for v in 0..vectors {
-                        let mut d = [simd.splat_f32s(0.0); SPAN];
-                        for x in 0..SPAN {
-                            d[x] = tile[x * vectors + v];
-                        }
-                        let d = input_points::<S>(simd, d);
-                        for x in 0..SPAN {
-                            S::as_mut_simd_f32s(&mut points[x][t]).0[v] = d[x];
-                        }
-                    }
-                }
-            }
+            let planes = out.chunks_exact_mut(stride * GROUP).skip(group).step_by(groups);
+            spread(simd, lines, block.columns, tile_row, planes, |d| input_points::<S>(simd, d));
         }
     }
 }
 
-/// Bᵀ · d for every column of six rows, in place.
+/// Transforms N rows of `lines` into six, in place, and then N columns of each tile into six, for the 36 `planes`
+/// `[stride][16]` of one group. `points` transforms N values.
 #[inline(always)]
-fn mix_rows<S: Simd>(simd: S, lines: &mut [f32]) {
-    let (lines, _) = S::as_mut_simd_f32s(lines);
-    let length = lines.len() / SPAN;
-    let mut rows = lines.chunks_exact_mut(length);
-    let [Some(a), Some(b), Some(c), Some(d), Some(e), Some(f)] = [(); SPAN].map(|()| rows.next()) else {
-        return;
-    };
-    for i in 0..length {
-        [a[i], b[i], c[i], d[i], e[i], f[i]] = input_points::<S>(simd, [a[i], b[i], c[i], d[i], e[i], f[i]]);
+pub fn spread<'a, S: Simd, const N: usize>(
+    simd: S,
+    lines: &mut [f32],
+    columns: usize,
+    tile_row: usize,
+    mut planes: impl Iterator<Item = &'a mut [f32]>,
+    points: impl Fn([S::f32s; N]) -> [S::f32s; SPAN],
+) {
+    let (length, vectors) = (lines.len() / SPAN, GROUP / S::F32_LANES);
+    let mut rows: [&mut [S::f32s]; SPAN] = [(); SPAN].map(|()| Default::default());
+    for (row, line) in rows.iter_mut().zip(lines.chunks_exact_mut(length)) {
+        *row = S::as_mut_simd_f32s(line).0;
+    }
+    for i in 0..rows[0].len() {
+        let mut d = [simd.splat_f32s(0.0); N];
+        for y in 0..N {
+            d[y] = rows[y][i];
+        }
+        let d = points(d);
+        for y in 0..SPAN {
+            rows[y][i] = d[y];
+        }
+    }
+    for line in lines.chunks_exact(length) {
+        let mut row: [&mut [[f32; GROUP]]; SPAN] = Default::default();
+        for (row, plane) in row.iter_mut().zip(planes.by_ref()) {
+            *row = &mut plane.as_chunks_mut().0[tile_row * columns..][..columns];
+        }
+        for t in 0..columns {
+            let (tile, _) = S::as_simd_f32s(&line[t * TILE * GROUP..][..N * GROUP]);
+            for v in 0..vectors {
+                let mut d = [simd.splat_f32s(0.0); N];
+                for x in 0..N {
+                    d[x] = tile[x * vectors + v];
+                }
+                let d = points(d);
+                for x in 0..SPAN {
+                    S::as_mut_simd_f32s(&mut row[x][t]).0[v] = d[x];
+                }
+            }
+        }
     }
 }
 

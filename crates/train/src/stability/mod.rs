@@ -38,8 +38,6 @@ rate = 1e-3
 rate = 1e-3
 [stage2]
 alpha_weight = 0.5
-anisotropy_weight = 0.1
-anisotropy_limit = 1.5
 points_weight = 1.0
 "#
 );

@@ -31,7 +31,7 @@ use crate::task::{Moment, Part, Task, Validation};
 use snapsnap_eval::preview::{grid, heat, picture};
 
 use scene::{Phase, gaussians, targets};
-pub use scene::{anisotropy_penalty, photometric};
+pub use scene::photometric;
 use scores::Scores;
 
 /// β: the share of the L1 loss, as published. The rest is the share of the structural dissimilarity.
@@ -216,10 +216,6 @@ impl Task for GaussianTask {
             }
             if phase.scale_weight > 0.0 {
                 add("scale", phase.scale_weight, mean(gaussians.scales.clone()));
-            }
-            if config.anisotropy_weight > 0.0 {
-                let penalty = anisotropy_penalty(&gaussians.scales, config.anisotropy_limit);
-                add("anisotropy", config.anisotropy_weight, penalty);
             }
         }
         let samples = items.len() as f64;

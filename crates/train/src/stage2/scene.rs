@@ -94,14 +94,6 @@ pub(super) fn targets(item: &Stage2Item, views: &[usize], device: &Device) -> (T
     (Tensor::from_data(pictures, device), Tensor::from_data(masks, device))
 }
 
-/// Anisotropy penalty of Gaussians with `scales` `[N,3]`: the mean of max(0, ln(longest / shortest axis) − ln(limit)).
-/// (A penalty on the mean scale has little effect on a few long Gaussians.)
-pub fn anisotropy_penalty(scales: &Tensor<2>, limit: f64) -> Tensor<1> {
-    let logs = scales.clone().clamp_min(1e-12).log();
-    let ratio = logs.clone().max_dim(1) - logs.min_dim(1);
-    mean((ratio - limit.ln()).clamp_min(0.0))
-}
-
 /// Mean absolute difference and mean structural similarity, each `[1]`, of pictures `[B,C,H,W]` with values in [0, 1].
 pub fn photometric(image: Tensor<4>, target: Tensor<4>) -> [Tensor<1>; 2] {
     let l1 = mean((image.clone() - target.clone()).abs());
@@ -110,8 +102,6 @@ pub fn photometric(image: Tensor<4>, target: Tensor<4>) -> [Tensor<1>; 2] {
 
 #[cfg(test)]
 mod tests {
-    use snapsnap_ops::host;
-
     use super::*;
 
     #[test]
@@ -123,13 +113,5 @@ mod tests {
         assert_eq!(phase(4000), Phase { views: 0..4, scale_weight: 0.0, one_view: true });
         assert_eq!(phase(10_000), Phase { views: 0..4, scale_weight: 0.0, one_view: false });
         assert_eq!(Phase::new(false, 0), phase(10_000));
-    }
-
-    #[test]
-    fn only_anisotropy_above_the_limit_costs() {
-        let device = Device::flex();
-        let scales = Tensor::<2>::from_floats([[0.01, 0.01, 0.08], [0.01, 0.1, 1.0]], &device);
-        let cost = host(anisotropy_penalty(&scales, 10.0))[0];
-        assert!((cost - 10.0_f32.ln() / 2.0).abs() < 1e-5, "{cost}");
     }
 }
