@@ -42,11 +42,11 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
     pair(&photographs, "b.png", "c.png");
     fs::write(photographs.join("broken.png"), b"no picture").expect("written");
     let table = photographs.join("pairs.csv");
-    let rows = "name,front,back\n,anna_front.png,anna_back.png\ntwice,anna_front.png,anna_front.png\nbad,broken.png,c.png\nlost,missing.png,c.png\nother,b.png,c.png\n";
+    let rows = "name,front,back\n,anna_front.png,anna_back.png\ntwice,anna_front.png,anna_front.png\n=bad,broken.png,c.png\nlost,missing.png,c.png\nother,b.png,c.png\n";
     fs::write(&table, rows).expect("written");
     let list = out.join("errors.csv");
     let errors = failed(&mut reconstruct(&table, &out), &list);
-    assert_eq!(errors.iter().map(|[name, _]| name.as_str()).collect::<Vec<_>>(), ["bad", "lost"]);
+    assert_eq!(errors.iter().map(|[name, _]| name.as_str()).collect::<Vec<_>>(), ["'=bad", "lost"], "no formulas");
     assert!(errors[0][1].contains("broken.png") && errors[1][1].contains("missing.png"), "{errors:?}");
     assert_eq!(names(&out), ["anna.ply", "errors.csv", "other.ply", "pairs.config.toml", "twice.ply"]);
     let single = temporary.path().join("single.ply");
@@ -68,7 +68,7 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
     assert_eq!(fs::read(out.join("anna.ply")).expect("reads"), b"kept");
     assert_eq!(
         names(&out),
-        ["anna.ply", "bad.ply", "lost.ply", "other.ply", "pairs.config.toml", "twice.ply"]
+        ["=bad.ply", "anna.ply", "lost.ply", "other.ply", "pairs.config.toml", "twice.ply"]
     );
     // Other settings than before.
     for options in [["--set", "regressor.margin=24"], ["--height", "1.8"]] {

@@ -383,6 +383,18 @@ fn a_sog_has_the_clouds_values_in_its_steps() {
         assert!((f32::from(c[3]) / 255.0 - opacities[row]).abs() < 0.51 / 255.0);
     }
     assert!(found.iter().all(|count| *count == 1), "each Gaussian once");
+
+    // One wild colour is cut off aloud, and leaves the others their codes.
+    let mut rows = cloud(n, 0);
+    rows[3].iter_mut().find(|(name, _)| *name == "f_dc_0").expect("a colour").1 = 1e30;
+    fs::write(path("wild.ply"), ply_bytes(&rows, Format::Little, "", b"")).expect("written");
+    let said = succeed(snapsnap().arg("convert").args([path("wild.ply"), path("wild.sog")]));
+    assert!(said.contains("1 scales and colours beyond ±100 were cut off there"), "{said}");
+    let mut archive = zip::ZipArchive::new(fs::File::open(path("wild.sog")).expect("a file")).expect("a ZIP");
+    let meta: Value = serde_json::from_reader(archive.by_name("meta.json").expect("a member")).expect("JSON");
+    let wild = numbers(&meta["sh0"]["codebook"]);
+    let most = dc.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+    assert!(wild.iter().filter(|code| code.abs() <= most).count() > 100, "{wild:?}");
 }
 
 /// Other programs' opacities of 0 and 1, flat Gaussians, and quaternions of any length but 0.

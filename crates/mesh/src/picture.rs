@@ -29,7 +29,7 @@ const MAX_FILE: u64 = 1 << 30;
 /// `most` bytes in memory. The size is checked before decoding.
 pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
     let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
-    guarded(path, || decode_from(path, file, most, false))
+    guarded(path, || decode_from(path, file, most, false, true))
 }
 
 /// The photograph in `path`, or in `bytes` if there are any: as [`decode`] reads it, with 8 bits, and in sRGB if it has
@@ -39,10 +39,10 @@ pub fn decode(path: &Path, most: u64) -> Result<DynamicImage, FileError> {
 /// As [`decode`], above [`MAX_BYTES`].
 pub fn photograph(path: &Path, bytes: Option<&[u8]>) -> Result<DynamicImage, FileError> {
     if let Some(bytes) = bytes {
-        return guarded(path, || decode_from(path, Cursor::new(bytes), MAX_BYTES, true));
+        return guarded(path, || decode_from(path, Cursor::new(bytes), MAX_BYTES, true, true));
     }
     let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
-    guarded(path, || decode_from(path, file, MAX_BYTES, true))
+    guarded(path, || decode_from(path, file, MAX_BYTES, true, true))
 }
 
 /// Width and height of the picture in `path`, without regard to its EXIF data.
@@ -71,12 +71,12 @@ fn size_from(path: &Path, mut source: impl BufRead + Seek) -> Result<[u32; 2], F
     size.map(Into::into).map_err(unreadable(path))
 }
 
-/// The picture in `bytes`. Errors name `path`, the file that contains it.
+/// The picture in `bytes`, whose EXIF data do not turn it: a texture of `path`, which errors name.
 ///
 /// # Errors
 /// As [`decode`].
 pub fn decode_bytes(path: &Path, bytes: &[u8], most: u64) -> Result<DynamicImage, FileError> {
-    guarded(path, || decode_from(path, Cursor::new(bytes), most, false))
+    guarded(path, || decode_from(path, Cursor::new(bytes), most, false, false))
 }
 
 /// For `map_err`: the error for an image in `path` that is damaged or of an unknown format.
@@ -101,6 +101,7 @@ fn decode_from(
     mut source: impl BufRead + Seek,
     most: u64,
     in_srgb: bool,
+    turned: bool,
 ) -> Result<DynamicImage, FileError> {
     let failed = unreadable(path);
     let check = |[width, height]: [u32; 2], stored: u64| {
@@ -147,7 +148,7 @@ fn decode_from(
     };
     let picture = if is_bmp && is_invisible(&picture) { picture.into_rgb8().into() } else { picture };
     let mut picture = if in_srgb { profile::to_srgb(picture, icc.as_deref()) } else { picture };
-    picture.apply_orientation(turn.unwrap_or(Orientation::NoTransforms));
+    picture.apply_orientation(turn.filter(|_| turned).unwrap_or(Orientation::NoTransforms));
     Ok(picture)
 }
 

@@ -1,6 +1,7 @@
-//! PLY meshes, ASCII and binary of either endianness: vertex colours, or a texture with coordinates per vertex or per
-//! corner.
+//! PLY meshes, ASCII and binary of either endianness: colours of vertices or faces, or a texture with coordinates per
+//! vertex or per corner.
 
+use std::collections::HashMap;
 use std::path::Path;
 use std::str::SplitAsciiWhitespace;
 
@@ -13,6 +14,8 @@ use crate::mesh::{Face, Material, Mesh};
 
 /// Most corners of a face; a longer list is a damaged file.
 const MAX_CORNERS: usize = 1 << 16;
+/// Most colours of faces; each is a material.
+const MAX_COLORS: usize = 1 << 12;
 
 pub fn read(path: &Path) -> Result<Mesh, FileError> {
     let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
@@ -162,17 +165,28 @@ fn column(element: &Element, names: &[&str]) -> Option<usize> {
     element.properties.iter().position(|p| p.list.is_none() && names.contains(&p.name.as_str()))
 }
 
+/// Indices of the properties with a colour.
+fn colors(element: &Element) -> Option<[usize; 3]> {
+    let names = [["red", "r", "diffuse_red"], ["green", "g", "diffuse_green"], ["blue", "b", "diffuse_blue"]];
+    let [r, g, b] = names.map(|names| column(element, &names));
+    Some([r?, g?, b?])
+}
+
+/// A stored intensity of a colour in [0, 1].
+fn intensity(value: f32, kind: Scalar) -> f32 {
+    match kind {
+        Scalar::F32 | Scalar::F64 => value,
+        Scalar::U16 => value / 65_535.0,
+        _ => value / 255.0,
+    }
+}
+
 fn vertices(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), String> {
     let place = ["x", "y", "z"].map(|name| column(element, &[name]));
     let [Some(x), Some(y), Some(z)] = place else {
         return Err("`vertex` has no properties `x`, `y`, `z`".into());
     };
-    let color = [["red", "r", "diffuse_red"], ["green", "g", "diffuse_green"], ["blue", "b", "diffuse_blue"]]
-        .map(|names| column(element, &names));
-    let color = match color {
-        [Some(r), Some(g), Some(b)] => Some([r, g, b]),
-        _ => None,
-    };
+    let color = colors(element);
     let s = column(element, &["s", "u", "texture_u"]);
     let texcoord = s.zip(column(element, &["t", "v", "texture_v"]));
     let mut values = vec![0.0; element.properties.len()];
@@ -183,13 +197,7 @@ fn vertices(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), S
         })?;
         mesh.positions.push(Vec3::new(values[x], values[y], values[z]));
         if let Some(columns) = color {
-            // Floats are in [0, 1] already.
-            let [r, g, b] = columns.map(|c| match element.properties[c].kind {
-                Scalar::F32 | Scalar::F64 => values[c],
-                Scalar::U16 => values[c] / 65_535.0,
-                _ => values[c] / 255.0,
-            });
-            mesh.colors.push(Vec3::new(r, g, b));
+            mesh.colors.push(Vec3::from(columns.map(|c| intensity(values[c], element.properties[c].kind))));
         }
         if let Some((s, t)) = texcoord {
             mesh.texcoords.push(Vec2::new(values[s], values[t]));
@@ -208,11 +216,15 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh, polygons: &mut Pol
     if mesh.materials.len() > 1 && !element.properties.iter().any(|p| is_number(&p.name)) {
         return Err(format!("it has {} textures, and `face` has no `texnumber`", mesh.materials.len()));
     }
+    // Colours of vertices and textures show more than colours of faces.
+    let is_plain = mesh.colors.is_empty() && mesh.materials.iter().all(|material| material.texture.is_none());
+    let color = colors(element).filter(|_| is_plain);
+    let mut materials: HashMap<[u32; 3], u32> = HashMap::new();
     let (mut corners, mut texcoords) = (Vec::new(), Vec::new());
     for row in 0..element.count {
         corners.clear();
         texcoords.clear();
-        let mut material = 0;
+        let (mut material, mut painted) = (0, [0.0; 3]);
         read_row(element, row, MAX_CORNERS, body, |body, column| {
             let property = &element.properties[column];
             match property.name.as_str() {
@@ -221,10 +233,26 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh, polygons: &mut Pol
                 }
                 name if is_number(name) => material = u32::try_from(body.count(property.kind)?).ok()?,
                 "texcoord" => texcoords.push(body.number(property.kind)?),
-                _ => drop(body.number(property.kind)?),
+                _ => {
+                    let value = body.number(property.kind)?;
+                    if let Some(channel) = color.and_then(|color| color.iter().position(|c| *c == column)) {
+                        painted[channel] = intensity(value, property.kind);
+                    }
+                }
             }
             Some(())
         })?;
+        if color.is_some() {
+            let next = mesh.materials.len() as u32;
+            material = *materials.entry(painted.map(f32::to_bits)).or_insert(next);
+            if material == next {
+                mesh.materials.push(Material { color: Vec3::from(painted), ..Material::default() });
+            }
+            if materials.len() > MAX_COLORS {
+                let advice = "give its vertices colours instead";
+                return Err(format!("its faces have more than {MAX_COLORS} colours: {advice}"));
+            }
+        }
         let first = mesh.texcoords.len() as u32;
         let per_corner = !polygons.per_vertex && !corners.is_empty() && texcoords.len() == 2 * corners.len();
         if per_corner {

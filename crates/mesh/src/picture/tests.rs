@@ -71,7 +71,9 @@ fn turned(kind: u16, stray: &[u8]) -> Vec<u8> {
 #[test]
 fn orientations_of_every_type_count_and_stray_bytes_between_segments_do_not() {
     let size = |bytes: Vec<u8>| {
-        let picture = decode_bytes(Path::new("a.jpg"), &bytes, MAX_BYTES).expect("decodes");
+        let picture = photograph(Path::new("a.jpg"), Some(&bytes)).expect("decodes");
+        // Textures of other files stay as they are.
+        assert_eq!(decode_bytes(Path::new("a.glb"), &bytes, MAX_BYTES).expect("decodes").width(), 120);
         [picture.width(), picture.height()]
     };
     assert_eq!(size(encoded(ImageFormat::Jpeg)), [120, 90]);

@@ -123,6 +123,26 @@ fn plys_with_several_textures_name_them_by_face() {
     }
 }
 
+#[test]
+fn colours_of_faces_become_materials() {
+    let folder = Folder::new();
+    let text = |count: usize, row: &dyn Fn(usize) -> String| {
+        let rows: String = (0..count).map(row).collect();
+        format!(
+            "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+             element face {count}\nproperty list uchar int vertex_indices\nproperty uchar red\n\
+             property uchar green\nproperty uchar blue\nend_header\n0 0 0\n1 0 0\n0 1 0\n{rows}"
+        )
+    };
+    let some = text(3, &|row| format!("3 0 1 2 {} 0 51\n", [255, 0, 255][row]));
+    let mesh = read(&folder.file("a.ply", some)).expect("reads");
+    let color = |face: usize| mesh.materials[mesh.faces[face].material as usize].color;
+    assert_eq!([0, 1, 2].map(color), [255.0, 0.0, 255.0].map(|red| Vec3::new(red, 0.0, 51.0) / 255.0));
+    let many = text(5000, &|row| format!("3 0 1 2 {} {} 0\n", row / 256, row % 256));
+    let error = read(&folder.file("b.ply", many)).map(|_| ()).expect_err("too many").to_string();
+    assert!(error.contains("more than 4096 colours: give its vertices colours instead"), "{error}");
+}
+
 /// The triangle of [`glb`] with another material, texture and further keys.
 fn with(material: &str, texture: &str, keys: &str) -> Vec<u8> {
     glb(|json| {
