@@ -41,7 +41,6 @@ kind = "cosine"
 warm_up = 2
 [stage2]
 alpha_weight = 0.5
-anisotropy_weight = 0.01
 "#
 );
 

@@ -8,9 +8,6 @@ use serde::Serialize;
 /// Probability above which a joint is seen.
 const SEEN: f32 = 0.5;
 
-/// Probability above which a joint is certainly seen.
-const CERTAIN: f32 = 0.9;
-
 /// The side of the body that a photograph shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -105,10 +102,6 @@ const LIMBS: [(Part, [(usize, f32); 2]); 4] = [
     (Part::LeftLeg, [(25, 0.6), (27, 1.0)]),
     (Part::RightLeg, [(26, 0.6), (28, 1.0)]),
 ];
-/// Bones of forearms, hands, calves and feet, and the radius that they have at least, as a share of the torso's length.
-const BONES: [[usize; 2]; 10] =
-    [[13, 15], [14, 16], [15, 19], [16, 20], [25, 27], [26, 28], [27, 31], [28, 32], [29, 31], [30, 32]];
-const RADIUS: f32 = 0.04;
 /// Joints at the ends of the limbs.
 const ENDS: [(Part, [usize; 2]); 4] = [
     (Part::LeftArm, [15, 19]),
@@ -138,12 +131,6 @@ impl Joints {
             let across = share(i % COUNT);
             left.lerp(right, across).lerp(hip_left.lerp(hip_right, across), share(i / COUNT))
         })
-    }
-
-    /// The visible bones of the limbs, from joint to joint, and their least radius in pixels.
-    pub fn bones(&self) -> impl Iterator<Item = ([Vec2; 2], f32)> {
-        let is_seen = |bone: &[usize; 2]| bone.iter().all(|joint| self.0[*joint].seen > CERTAIN);
-        BONES.into_iter().filter(is_seen).map(|bone| (bone.map(|joint| self.at(joint)), RADIUS * self.length()))
     }
 
     /// Length of the torso in pixels.

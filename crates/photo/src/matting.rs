@@ -96,19 +96,7 @@ pub fn matte(
     let mut probability = bilinear(probability, [SIDE; 2], size);
     if let Some(look) = &look {
         let scale = size[0] as f32 / part.height as f32 / look.scale();
-        let mut seen = look.probabilities(part, size);
-        let step = Vec2::new(part.width as f32 / size[1] as f32, part.height as f32 / size[0] as f32);
-        let corner = Vec2::new(part.x as f32, part.y as f32);
-        for ([start, end], radius) in look.joints.bones() {
-            for (i, p) in seen.iter_mut().enumerate() {
-                let at = corner + step * (Vec2::new((i % size[1]) as f32, (i / size[1]) as f32) + 0.5);
-                let along = (at - start).dot(end - start) / (end - start).length_squared().max(1.0);
-                if at.distance(start.lerp(end, along.clamp(0.0, 1.0))) < radius {
-                    *p = 1.0;
-                }
-            }
-        }
-        probability = combined(&probability, &seen, size[1], scale);
+        probability = combined(&probability, &look.probabilities(part, size), size[1], scale);
     }
     Filter::new(&person, &probability, size).cut_out(&picture, &mut mask, part);
     if let Some(strokes) = strokes {
