@@ -46,7 +46,11 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
     fs::write(&table, rows).expect("written");
     let list = out.join("errors.csv");
     let errors = failed(&mut reconstruct(&table, &out), &list);
-    assert_eq!(errors.iter().map(|[name, _]| name.as_str()).collect::<Vec<_>>(), ["'=bad", "lost"], "no formulas");
+    assert_eq!(
+        errors.iter().map(|[name, _]| name.as_str()).collect::<Vec<_>>(),
+        ["'=bad", "lost"],
+        "no formulas"
+    );
     assert!(errors[0][1].contains("broken.png") && errors[1][1].contains("missing.png"), "{errors:?}");
     assert_eq!(names(&out), ["anna.ply", "errors.csv", "other.ply", "pairs.config.toml", "twice.ply"]);
     let single = temporary.path().join("single.ply");

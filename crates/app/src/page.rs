@@ -6,8 +6,8 @@ use std::net::{Ipv4Addr, TcpListener};
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 
 use clap::Args;
-use snapsnap_base::FileError;
 use http::StatusCode;
+use snapsnap_base::FileError;
 
 use crate::failure::Failure;
 use crate::server::{Answer, Body, Content, Refusal, Request, serve};

@@ -26,6 +26,7 @@ mod window;
 
 pub use backing::backing;
 pub use hull::dilated;
+pub use nearest_colors::median;
 pub use network::pixel_width;
 pub use photograph::Photograph;
 pub use points::Points;

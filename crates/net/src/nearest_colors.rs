@@ -1,10 +1,11 @@
-//! Colours of the unseen sides: every side point takes the colour of the nearest front or back point
-//! (docs/method.md, "Side colours").
+//! Colours of the unseen sides: every side point takes the colour of the nearest front or back point, or the most usual
+//! colour around this point (docs/method.md, "Side colours").
 
 use std::num::NonZeroUsize;
 
 use glam::Vec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rayon::prelude::*;
 
 /// Value of a side pixel without a point.
 pub(crate) const EMPTY: f32 = -1.0;
@@ -14,9 +15,13 @@ const NEAR: f32 = 0.05;
 /// Least number of points in a thinned cloud.
 const THINNED: usize = 20_000;
 
+/// Number of nearest points among which a colour is the most usual one.
+const NEIGHBOURS: NonZeroUsize = NonZeroUsize::new(45).expect("is not 0");
+
 /// Coloured points for nearest-neighbour search.
 struct Cloud {
     tree: ImmutableKdTree<f32, 3>,
+    points: Vec<[f32; 3]>,
     colors: Vec<[f32; 3]>,
     /// Every `step`-th point, for queries farther than [`NEAR`].
     thinned: ImmutableKdTree<f32, 3>,
@@ -35,15 +40,14 @@ impl Cloud {
         }
         let step = (points.len() / THINNED).max(1);
         let some = points.iter().copied().step_by(step).collect::<Vec<_>>();
-        let [tree, thinned] = [points, some].map(|points| {
-            ImmutableKdTree::new_from_slice(&points).expect("fewer points than u32 can number")
-        });
-        Some(Self { tree, colors, thinned, step })
+        let [tree, thinned] = [&points, &some]
+            .map(|points| ImmutableKdTree::new_from_slice(points).expect("fewer points than u32 can number"));
+        Some(Self { tree, points, colors, thinned, step })
     }
 
-    /// Colour of the nearest neighbour of each point (metres), on all cores; [`EMPTY`] for points that are not finite.
-    fn nearest_colors(&self, points: &[[f32; 3]]) -> Vec<[f32; 3]> {
-        let mut colors = vec![[EMPTY; 3]; points.len()];
+    /// The nearest neighbour of each point (metres), on all cores; `None` for points that are not finite.
+    fn nearest(&self, points: &[[f32; 3]]) -> Vec<Option<usize>> {
+        let mut rows = vec![None; points.len()];
         let mut left: Vec<usize> = (0..points.len()).filter(|i| Vec3::from(points[*i]).is_finite()).collect();
         for (tree, distance, step) in [(&self.tree, NEAR, 1), (&self.thinned, f32::INFINITY, self.step)] {
             let queries: Vec<[f32; 3]> = left.iter().map(|i| points[*i]).collect();
@@ -52,19 +56,53 @@ impl Cloud {
             let mut nearest = found.iter().map(|found| found.first());
             left.retain(|i| match nearest.next().flatten() {
                 Some(found) => {
-                    colors[*i] = self.colors[step * found.item as usize];
+                    rows[*i] = Some(step * found.item as usize);
                     false
                 }
                 None => true,
             });
         }
-        colors
+        rows
+    }
+
+    /// The colours of these rows of the cloud, each replaced by the most usual colour around it: of the nearest
+    /// points' colours, the one nearest to the median of each channel.
+    fn usual_colors(&self, rows: &[usize]) -> Vec<[f32; 3]> {
+        let queries: Vec<[f32; 3]> = rows.iter().map(|row| self.points[*row]).collect();
+        let found = self.tree.query_batch(&queries).nearest_n::<SquaredEuclidean<f32>>(NEIGHBOURS);
+        let found = found.within(NEAR * NEAR).execute();
+        let color = |row: usize| Vec3::from(self.colors[row]);
+        let near = found.iter().map(|found| found.iter().map(|found| color(found.item as usize)).collect());
+        let near: Vec<Vec<Vec3>> = near.collect();
+        let usual = |(near, row): (&Vec<Vec3>, &usize)| {
+            let median = median(near).unwrap_or_default();
+            let apart = |color: &&Vec3| color.distance_squared(median);
+            near.iter()
+                .min_by(|a, b| apart(a).total_cmp(&apart(b)))
+                .map_or(self.colors[*row], |c| c.to_array())
+        };
+        near.par_iter().zip(rows).map(usual).collect()
     }
 }
 
+/// The median of each channel; `None` without colours.
+pub fn median(colors: &[Vec3]) -> Option<Vec3> {
+    let channel = |c: usize| {
+        let mut values: Vec<f32> = colors.iter().map(|color| color[c]).collect();
+        *values.select_nth_unstable_by(colors.len() / 2, f32::total_cmp).1
+    };
+    (!colors.is_empty()).then(|| Vec3::new(channel(0), channel(1), channel(2)))
+}
+
 /// Pseudo images of the sides' maps `[3, S, S]`: every valid pixel has the colour of the nearest valid point of the
-/// photographs `[3, S, S]`. `points` `[V, S, S, 3]` are the points of all views.
-pub fn side_images(photos: [&[f32]; 2], points: &[f32], valid: &[Vec<bool>]) -> Vec<Vec<f32>> {
+/// photographs `[3, S, S]`, or the most usual colour around this point, `is_usual`: pixels of a mask's rim may show the
+/// background. `points` `[V, S, S, 3]` are the points of all views.
+pub fn side_images(
+    photos: [&[f32]; 2],
+    points: &[f32],
+    valid: &[Vec<bool>],
+    is_usual: bool,
+) -> Vec<Vec<f32>> {
     let area = valid[0].len();
     let points = points.as_chunks::<3>().0;
     let point = |view: usize, i: usize| -> [f32; 3] { points[view * area + i] };
@@ -74,17 +112,32 @@ pub fn side_images(photos: [&[f32]; 2], points: &[f32], valid: &[Vec<bool>]) -> 
         (0..area).filter(|&i| mask[i]).map(move |i| (point(view, i), color(i)))
     });
     let cloud = Cloud::new(seen);
-    (2..valid.len()).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view])).collect()
+    (2..valid.len()).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view], is_usual)).collect()
 }
 
-fn paint(cloud: Option<&Cloud>, point: impl Fn(usize) -> [f32; 3], valid: &[bool]) -> Vec<f32> {
+fn paint(
+    cloud: Option<&Cloud>,
+    point: impl Fn(usize) -> [f32; 3],
+    valid: &[bool],
+    is_usual: bool,
+) -> Vec<f32> {
     let area = valid.len();
     let mut image = vec![EMPTY; 3 * area];
     let Some(cloud) = cloud else { return image };
     let pixels: Vec<usize> = (0..area).filter(|&i| valid[i]).collect();
     let points: Vec<[f32; 3]> = pixels.iter().map(|&i| point(i)).collect();
-    for (&i, color) in pixels.iter().zip(cloud.nearest_colors(&points)) {
-        for (channel, value) in color.into_iter().enumerate() {
+    let rows = cloud.nearest(&points);
+    // Many pixels share a neighbour.
+    let mut used: Vec<usize> = rows.iter().flatten().copied().collect();
+    used.sort_unstable();
+    used.dedup();
+    let colors = match is_usual {
+        true => cloud.usual_colors(&used),
+        false => used.iter().map(|row| cloud.colors[*row]).collect(),
+    };
+    for (&i, row) in pixels.iter().zip(rows) {
+        let Some(place) = row.and_then(|row| used.binary_search(&row).ok()) else { continue };
+        for (channel, value) in colors[place].into_iter().enumerate() {
             image[channel * area + i] = value;
         }
     }
@@ -100,8 +153,16 @@ mod tests {
     fn far_points_have_a_neighbour_near_the_nearest() {
         let line = (0..100_000).map(|i| i as f32 * 1e-5);
         let cloud = Cloud::new(line.map(|x| ([x, 0.0, 0.0], [x; 3]))).expect("points");
-        let found = cloud.nearest_colors(&[[0.30001, 0.04, 0.0], [0.30001, 0.2, 0.0]]);
-        assert!((found[0][0] - 0.30001).abs() < 1e-6 && (found[1][0] - 0.30001).abs() <= 5e-5, "{found:?}");
+        let found = cloud.nearest(&[[0.30001, 0.04, 0.0], [0.30001, 0.2, 0.0]]);
+        let found: Vec<f32> = found.into_iter().flatten().map(|row| cloud.colors[row][0]).collect();
+        assert!((found[0] - 0.30001).abs() < 1e-6 && (found[1] - 0.30001).abs() <= 5e-5, "{found:?}");
+        // Neighbours' colours rise along the line. A speck has the colour of its surroundings.
+        let usual = cloud.usual_colors(&[50_000])[0][0];
+        assert!((usual - 0.5).abs() < 5e-4, "{usual}");
+        let mut specked = cloud;
+        specked.colors[50_000] = [9.0; 3];
+        let usual = specked.usual_colors(&[50_000])[0][0];
+        assert!((usual - 0.5).abs() < 5e-4, "{usual}");
     }
 
     #[test]
@@ -111,7 +172,9 @@ mod tests {
         let cloud = Cloud::new(bad.into_iter().chain(same)).expect("points");
         assert_eq!(cloud.colors.len(), 5000);
         let queries = [[1.0, 2.0, 3.1], [1e15; 3], [f32::NAN; 3], [f32::NEG_INFINITY; 3]];
-        assert_eq!(cloud.nearest_colors(&queries), [[0.5; 3], [0.5; 3], [EMPTY; 3], [EMPTY; 3]]);
+        let found: Vec<bool> = cloud.nearest(&queries).iter().map(Option::is_some).collect();
+        assert_eq!(found, [true, true, false, false]);
+        assert_eq!(cloud.usual_colors(&[7]), [[0.5; 3]]);
         assert!(Cloud::new(bad.into_iter()).is_none());
     }
 }

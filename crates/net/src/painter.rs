@@ -85,7 +85,7 @@ impl Painter<'_> {
             self.photographs.map(|photo| photograph_colors(&config.regressor, &photo.rgb, &photo.mask));
         let colors = [&*colors[0], &*colors[1]];
         let side_images = if views > 2 && self.side_colors {
-            record.timed("side colours", |_| side_images(colors, &points.host, &valid))
+            record.timed("side colours", |_| side_images(colors, &points.host, &valid, !config.mode.compat))
         } else {
             record.steps.push(Step::NoSideColors { as_asked: views > 2 });
             vec![vec![EMPTY; 3 * area]; views - 2]

@@ -3,8 +3,9 @@
 use glam::Vec3;
 use image::{GrayImage, RgbImage};
 
-use super::{INSIDE, median};
+use super::INSIDE;
 use crate::rect::Rect;
+use snapsnap_net::median;
 
 /// Number of rows of the person's box that are compared.
 const ROWS: u32 = 200;

@@ -186,12 +186,3 @@ fn unit(value: u8) -> f32 {
 fn unit_color(pixel: &Rgb<u8>) -> Vec3 {
     Vec3::from(pixel.0.map(f32::from)) / 255.0
 }
-
-/// The median of each channel; `None` without colours.
-fn median(colors: &[Vec3]) -> Option<Vec3> {
-    let channel = |c: usize| {
-        let mut values: Vec<f32> = colors.iter().map(|color| color[c]).collect();
-        *values.select_nth_unstable_by(colors.len() / 2, f32::total_cmp).1
-    };
-    (!colors.is_empty()).then(|| Vec3::new(channel(0), channel(1), channel(2)))
-}

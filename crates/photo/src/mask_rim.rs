@@ -3,9 +3,10 @@
 use glam::Vec3;
 use image::{GrayImage, RgbImage};
 
+use crate::INSIDE;
 use crate::rect::Rect;
 use crate::rim::{Colors, HEIGHT, LEAST_DISTINCT, MAX_REACH, REACH, Rim, pixel};
-use crate::{INSIDE, median};
+use snapsnap_net::median;
 
 /// A mask is too large if this share of the distinct outline shows more of the background than of the person. Masks too
 /// large by two thirds of [`REACH`] are corrected.

@@ -124,11 +124,7 @@ impl Default for TrainingConfig {
 
 impl Default for Stage2Config {
     fn default() -> Self {
-        Self {
-            curriculum: false,
-            alpha_weight: 0.0,
-            points_weight: 0.0,
-        }
+        Self { curriculum: false, alpha_weight: 0.0, points_weight: 0.0 }
     }
 }
 

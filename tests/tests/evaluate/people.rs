@@ -42,8 +42,7 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
     let other = weights(2).display().to_string();
     let groups = "groups.loose.subjects=[\"0001\"]";
     let ablation = "ablations.sideless.sides=false";
-    let arguments =
-        ["--against", &other, "--set", groups, "--set", "views.turns=[0, 3]"];
+    let arguments = ["--against", &other, "--set", groups, "--set", "views.turns=[0, 3]"];
     succeed(evaluate(people(), &report, &arguments).args(["--set", ablation]));
     let found = json(&report);
     for key in

@@ -253,7 +253,16 @@ fn fill(file: &mut File, part: &Path, item: &Item, address: &str) -> Result<(), 
         let limit = item.bytes.to_string();
         let mut curl = Command::new("curl");
         curl.args(["--fail", "--location", "--show-error", meter, "--connect-timeout", "60"]);
-        curl.args(["--speed-limit", "1", "--speed-time", "60", "--max-filesize", &limit, "--continue-at", "-"]);
+        curl.args([
+            "--speed-limit",
+            "1",
+            "--speed-time",
+            "60",
+            "--max-filesize",
+            &limit,
+            "--continue-at",
+            "-",
+        ]);
         curl.arg("--output").arg(part).args(["--", address]);
         let ended = curl.stdin(Stdio::null()).stdout(Stdio::null()).status().map_err(|e| {
             let advice = format!("fetch {address} by other means, and give its folder with --from");

@@ -9,6 +9,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use clap::Args;
 use glam::Vec2;
+use http::StatusCode;
 use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
 use image::{GrayImage, ImageFormat};
@@ -17,7 +18,6 @@ use snapsnap_mesh::picture;
 use snapsnap_net::Reconstructor;
 use snapsnap_photo::{Content, Cutting, Doubt, Figure, Joint, Sign, Source, Told, cut_out, person};
 use snapsnap_splat::scene::Stored;
-use http::StatusCode;
 
 use crate::downloads::{self, Download};
 use crate::failure::Failure;

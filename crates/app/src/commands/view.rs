@@ -7,8 +7,8 @@ use std::sync::{Arc, LazyLock, Mutex, PoisonError, Weak};
 use std::time::SystemTime;
 
 use clap::Args;
-use snapsnap_base::FileError;
 use http::StatusCode;
+use snapsnap_base::FileError;
 
 use super::convert::{drawable, read};
 use crate::downloads::{self, Download};

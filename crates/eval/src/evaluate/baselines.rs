@@ -51,7 +51,7 @@ pub fn true_points(
     device: &Device,
 ) -> Gaussians {
     let sides = match (photographs, valid.len()) {
-        ([front, back], 4) => side_images([front, back], points, valid),
+        ([front, back], 4) => side_images([front, back], points, valid, false),
         _ => Vec::new(),
     };
     // The points of all views are in the first camera's frame.

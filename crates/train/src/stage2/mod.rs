@@ -30,8 +30,8 @@ use crate::ranks::Ranks;
 use crate::task::{Moment, Part, Task, Validation};
 use snapsnap_eval::preview::{grid, heat, picture};
 
-use scene::{Phase, gaussians, targets};
 pub use scene::photometric;
+use scene::{Phase, gaussians, targets};
 use scores::Scores;
 
 /// β: the share of the L1 loss, as published. The rest is the share of the structural dissimilarity.
