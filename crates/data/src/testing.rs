@@ -15,7 +15,7 @@ use snapsnap_people::synth;
 pub fn person() -> &'static Mesh {
     static PERSON: OnceLock<Mesh> = OnceLock::new();
     PERSON.get_or_init(|| {
-        let mut mesh = synth::person("train/1/0", None);
+        let mut mesh = synth::person("train/1/25", None);
         normalise(&mut mesh, Collection::Other, None).expect("has height");
         mesh
     })

@@ -31,7 +31,7 @@ fn config() -> TrainConfig {
         "network.net_resolution=32",
         "network.conf_threshold=0.4",
         "training.validation_samples=0",
-        "training.seed=1",
+        "training.seed=2",
     ];
     TrainConfig::from_toml(TRAINING, "the tests' config", &OTHER.map(String::from)).expect("a config")
 }
@@ -109,24 +109,18 @@ fn compare_gradients(
 
 fn compare_weights(stage: &str, expected_rows: &Rows, after: &Networks, expected_after: &Networks) {
     let total: f64 = gradients::norm(expected_rows);
-    let got = after.rows();
-    for (name, expected) in expected_after.rows() {
-        let (got, expected) = (values(got[&name].clone()), values(expected));
+    let (got, expected) = (after.checkpoint(), expected_after.checkpoint());
+    for (name, expected) in expected {
+        // AdamW's first step has the same length for a rounding error as for any other gradient.
         let Some(row) = expected_rows.get(&name) else {
             // The first unit of the coarsest fusion never runs.
-            assert_eq!(got, expected, "{stage}: {name} has no gradient");
+            assert_eq!(got[&name], expected, "{stage}: {name} has no gradient");
             continue;
         };
-        let row = values(row.clone());
-        let norm_of = |values: &[f32]| values.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-        let (norm, size) = (norm_of(&row), norm_of(&expected));
-        if norm > 1e-3 * total && size > 1e-3 {
-            // AdamW's first step has the same length for a rounding error as for any other gradient.
-            let is_told = |(_, gradient): &(&f32, &f32)| f64::from(gradient.abs()) > 1e-3 * norm;
-            let told = |values: &[f32]| {
-                values.iter().zip(&row).filter(is_told).map(|(v, _)| *v).collect::<Vec<f32>>()
-            };
-            let error = relative_error(&told(&got), &told(&expected));
+        let norm = values(row.clone()).iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
+        let size = expected.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+        if norm.sqrt() > 1e-3 * total && size > 1e-3 {
+            let error = relative_error(&got[&name], &expected);
             assert!(error <= 1e-4, "{stage}: {name} after a step: {error:e}");
         }
     }
