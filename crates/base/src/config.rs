@@ -20,28 +20,18 @@ const EXTENDS: &str = "extends";
 
 /// A config that cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the names say it")]
 pub enum ConfigError {
     /// The file could not be read.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Not TOML, an unknown key, a wrong type or an unknown name.
+    /// Not TOML, an unknown key, a wrong type or an unknown name. The parser's message has the line and the key.
     #[error("{origin}: {message}")]
-    Syntax {
-        /// File or other origin of the text.
-        origin: String,
-        /// The parser's message, with line and key.
-        message: String,
-    },
-    /// A value that is not allowed, by itself or together with the value of another key.
+    Syntax { origin: String, message: String },
+    /// A value that is not allowed, by itself or together with the value of another key. The key is dotted; the message
+    /// has the fault and the allowed values.
     #[error("{origin}: `{key}`: {message}")]
-    Value {
-        /// File or other origin of the text.
-        origin: String,
-        /// Dotted key.
-        key: String,
-        /// The fault and the allowed values.
-        message: String,
-    },
+    Value { origin: String, key: String, message: String },
 }
 
 /// The type of a config. Every key has a default, so that a file may hold any part of it.

@@ -31,31 +31,17 @@ pub fn guarded<T>(path: &Path, read: impl FnOnce() -> Result<T, FileError>) -> R
 
 /// Errors of files; each names its file.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the names say it")]
 pub enum FileError {
     /// Missing or unreadable file.
     #[error("{path}: cannot read: {source}")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
+    Read { path: PathBuf, source: std::io::Error },
     /// A file that could not be written.
     #[error("{path}: cannot write: {source}")]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// A file that can be read but not used.
+    Write { path: PathBuf, source: std::io::Error },
+    /// A file that can be read but not used, with the fault and the remedy.
     #[error("{path}: {message}")]
-    Unsuitable {
-        /// The file.
-        path: PathBuf,
-        /// The fault and the remedy.
-        message: String,
-    },
+    Unsuitable { path: PathBuf, message: String },
 }
 
 impl FileError {

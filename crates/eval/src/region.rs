@@ -1,7 +1,9 @@
 //! Regions in which pictures are compared: the whole picture, the paper's window around the person, or the person
 //! (docs/method.md, "Evaluation").
 
-use snapsnap_net::dilated;
+use std::ops::Range;
+
+use snapsnap_net::{Window, dilated};
 
 use crate::EvalError;
 use crate::pictures::Picture;
@@ -36,16 +38,17 @@ impl Region {
     pub fn paper(target: &Picture) -> Result<Self, EvalError> {
         let Picture { width, height, .. } = *target;
         let seen = |i: usize| (0..3).any(|c| target.plane(c)[i] != 0.0);
-        let Some([left, top, right, bottom]) = bounds(width, height, seen) else {
+        let seen: Vec<bool> = (0..width * height).map(seen).collect();
+        let Some(Window { rows, columns }) = Window::around([&seen[..]].into_iter(), width) else {
             let message = "the true picture is black throughout: there is no person";
             return Err(EvalError::Message(message.into()));
         };
         let side = |of: usize, most: usize| ((of * height + AT / 2) / AT).clamp(1, most);
         let [h, w] = [side(PAPER[0], height), side(PAPER[1], width)];
-        let place = |from: usize, to: usize, side: usize, most: usize| {
-            ((from + to) / 2).saturating_sub(side / 2).min(most - side)
+        let place = |of: Range<usize>, side: usize, most: usize| {
+            ((of.start + of.end - 1) / 2).saturating_sub(side / 2).min(most - side)
         };
-        let window = [place(left, right, w, width), place(top, bottom, h, height), w, h];
+        let window = [place(columns, w, width), place(rows, h, height), w, h];
         Ok(Self { window, inside: None })
     }
 
@@ -53,14 +56,14 @@ impl Region {
     ///
     /// # Errors
     /// [`EvalError::Message`] for a mask without a person.
-    pub fn masked(mask: &[f32], [height, width]: [usize; 2], margin: usize) -> Result<Self, EvalError> {
+    pub fn masked(mask: &[f32], [_, width]: [usize; 2], margin: usize) -> Result<Self, EvalError> {
         let inside = dilated(&mask.iter().map(|v| *v > 0.0).collect::<Vec<_>>(), width, margin);
-        let Some([left, top, right, bottom]) = bounds(width, height, |i| inside[i]) else {
+        let Some(Window { rows, columns }) = Window::around([&inside[..]].into_iter(), width) else {
             return Err(EvalError::Message("the mask is empty: there is no person".into()));
         };
-        let window = [left, top, right + 1 - left, bottom + 1 - top];
-        let line = |row: usize| &inside[row * width + left..row * width + right + 1];
-        let inside = (top..=bottom).flat_map(line).copied().collect();
+        let window = [columns.start, rows.start, columns.len(), rows.len()];
+        let line = |row: usize| &inside[row * width..][columns.clone()];
+        let inside = rows.flat_map(line).copied().collect();
         Ok(Self { window, inside: Some(inside) })
     }
 
@@ -83,17 +86,6 @@ impl Region {
 /// Margin of the protocol `masked` in pictures of this height: 8 pixels of 1024.
 pub fn margin(height: usize) -> usize {
     (MARGIN * height).div_ceil(AT)
-}
-
-/// Left, top, right and bottom of the bounding box of the set pixels, inclusive; `None` if no pixel is set.
-fn bounds(width: usize, height: usize, is_set: impl Fn(usize) -> bool) -> Option<[usize; 4]> {
-    let mut found: Option<[usize; 4]> = None;
-    for i in (0..width * height).filter(|i| is_set(*i)) {
-        let (x, y) = (i % width, i / width);
-        let [left, top, right, bottom] = found.get_or_insert([x, y, x, y]);
-        (*left, *top, *right, *bottom) = ((*left).min(x), (*top).min(y), (*right).max(x), (*bottom).max(y));
-    }
-    found
 }
 
 #[cfg(test)]

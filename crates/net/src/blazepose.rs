@@ -9,6 +9,8 @@ use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_ops::{bilinear, host, layers};
 
+use Block::{Halved, Residual, Wider};
+
 use crate::u2net::convolution;
 use crate::weights::{Source, WeightsError};
 
@@ -18,20 +20,8 @@ pub const SIDE: usize = 256;
 const CONVOLUTIONS: usize = 94;
 /// The encoder's inverted residual blocks after the first one (Sandler et al., "MobileNetV2", 2018).
 const BLOCKS: [Block; 14] = [
-    Block::Halved,
-    Block::Residual,
-    Block::Halved,
-    Block::Residual,
-    Block::Halved,
-    Block::Residual,
-    Block::Residual,
-    Block::Wider,
-    Block::Residual,
-    Block::Residual,
-    Block::Halved,
-    Block::Residual,
-    Block::Residual,
-    Block::Residual,
+    Halved, Residual, Halved, Residual, Halved, Residual, Residual, Wider, Residual, Residual, Halved,
+    Residual, Residual, Residual,
 ];
 /// Blocks of the landmarks' branch, and the blocks among them that halve the size.
 const BRANCH: usize = 11;
@@ -82,10 +72,10 @@ impl BlazePose {
         convolutions[row].stride = [2; 2];
         row += 3;
         for block in BLOCKS {
-            if block == Block::Halved {
+            if block == Halved {
                 convolutions[row + 3].stride = [2; 2];
             }
-            row += if block == Block::Halved { 5 } else { 3 };
+            row += if block == Halved { 5 } else { 3 };
         }
         // Both layers before the branches, the mask's branch, and the first two layers of the landmarks' branch.
         row += 2 + 13 + 2;
@@ -111,13 +101,13 @@ impl BlazePose {
         let mut finer = Vec::new();
         for block in BLOCKS {
             let mut inner = clipped(plain(x.clone()));
-            if block == Block::Halved {
+            if block == Halved {
                 let part = clipped(plain(x.clone()));
                 finer.push(clipped(plain(part)));
             }
             inner = clipped(plain(inner));
             let narrow = plain(inner);
-            x = if block == Block::Residual { narrow + x } else { narrow };
+            x = if block == Residual { narrow + x } else { narrow };
         }
         for _ in 0..2 {
             x = clipped(plain(x));

@@ -80,7 +80,6 @@ pub struct NetworkConfig {
     /// Whether the right and left heads exist; without them only the two photographed sides are predicted.
     pub side_heads: bool,
     /// The network that refines the photographs' points; unset: none.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub details: Option<DetailsConfig>,
     /// How the maps of the unseen sides are made.
     pub sides: Sides,
@@ -100,7 +99,6 @@ pub struct NetworkConfig {
     /// A side pixel becomes a Gaussian where its confidence exceeds this value.
     pub conf_threshold: f32,
     /// Enlargement of points and confidences from `net_resolution` to `resolution`; unset: follows `mode.compat`.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub upsample: Option<Upsample>,
     /// Initial value of δ, the learned global scale of the points (metres per network unit).
     pub delta: f64,
@@ -124,7 +122,6 @@ pub struct NetworkConfig {
     pub on_rays: bool,
     /// Margin around the photographs' silhouettes, in pixels of a canvas of 1024. Points of an unseen side that
     /// project outside of the grown silhouettes are left out. Unset: all points are kept.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub hull_margin: Option<usize>,
     /// Largest distance in metres by which a point of an unseen side moves along its line of sight, away from the
     /// side's camera, to lie inside both silhouettes. In force only with [`Self::hull_margin`].
@@ -240,7 +237,6 @@ pub struct RegressorConfig {
     /// 1: one network for all views; 2: one for front and back, one for the sides (the paper's ablation).
     pub networks: usize,
     /// Reference of the network's output and source of the colours; unset: as published.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<RegressorStart>,
     /// Largest colour corrections, for pixels of the photographs and of the unseen sides, as shares of the range from
     /// black to white.
@@ -251,7 +247,6 @@ pub struct RegressorConfig {
     pub least_opacities: [f64; 2],
     /// With `mode.crop`, margin in pixels around the person's box that the network receives; unset: the receptive
     /// radius. Training and inference should use the same value.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub margin: Option<usize>,
 }
 
@@ -286,20 +281,15 @@ pub struct ModeConfig {
     /// Reproduces every quirk of the published code, which the published weights were trained with.
     pub compat: bool,
     /// Axes that predicted quaternions refer to.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub rotation_frame: Option<RotationFrame>,
     /// Reduction of the canvas from `resolution` to `net_resolution`.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub downsample: Option<Downsample>,
     /// World frame of the PLY.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub world_frame: Option<WorldFrame>,
     /// Whether the regressor receives only the person's box and `regressor.margin` around it. Its group norms then
     /// measure less background, which changes the results of weights trained on the whole canvas (docs/inference.md).
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub crop: Option<bool>,
     /// Height to which the person is scaled, in pixels of a canvas of 1024.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub person_height: Option<usize>,
 }
 

@@ -15,34 +15,30 @@ const NEAR: f32 = 0.05;
 /// Least number of points in a thinned cloud.
 const THINNED: usize = 20_000;
 
-/// Number of nearest points among which a colour is the most usual one.
-const NEIGHBOURS: NonZeroUsize = NonZeroUsize::new(45).expect("is not 0");
+/// Pixels to each side of a photograph's pixel among which a colour is the most usual one. A third of
+/// the rows and columns is enough.
+const REACH: usize = 6;
+const STEP: usize = 3;
 
-/// Coloured points for nearest-neighbour search.
+/// Points for nearest-neighbour search.
 struct Cloud {
     tree: ImmutableKdTree<f32, 3>,
-    points: Vec<[f32; 3]>,
-    colors: Vec<[f32; 3]>,
     /// Every `step`-th point, for queries farther than [`NEAR`].
     thinned: ImmutableKdTree<f32, 3>,
     step: usize,
 }
 
 impl Cloud {
-    /// A cloud of points (metres) with colours. Points that are not finite are left out.
-    ///
-    /// `None` if no finite point is left.
-    fn new(points: impl Iterator<Item = ([f32; 3], [f32; 3])>) -> Option<Self> {
-        let (points, colors): (Vec<[f32; 3]>, Vec<_>) =
-            points.filter(|(p, _)| Vec3::from(*p).is_finite()).unzip();
+    /// A cloud of finite points (metres). `None` if there is no point.
+    fn new(points: &[[f32; 3]]) -> Option<Self> {
         if points.is_empty() {
             return None;
         }
         let step = (points.len() / THINNED).max(1);
         let some = points.iter().copied().step_by(step).collect::<Vec<_>>();
-        let [tree, thinned] = [&points, &some]
+        let [tree, thinned] = [points, &some]
             .map(|points| ImmutableKdTree::new_from_slice(points).expect("fewer points than u32 can number"));
-        Some(Self { tree, points, colors, thinned, step })
+        Some(Self { tree, thinned, step })
     }
 
     /// The nearest neighbour of each point (metres), on all cores; `None` for points that are not finite.
@@ -64,25 +60,6 @@ impl Cloud {
         }
         rows
     }
-
-    /// The colours of these rows of the cloud, each replaced by the most usual colour around it: of the nearest
-    /// points' colours, the one nearest to the median of each channel.
-    fn usual_colors(&self, rows: &[usize]) -> Vec<[f32; 3]> {
-        let queries: Vec<[f32; 3]> = rows.iter().map(|row| self.points[*row]).collect();
-        let found = self.tree.query_batch(&queries).nearest_n::<SquaredEuclidean<f32>>(NEIGHBOURS);
-        let found = found.within(NEAR * NEAR).execute();
-        let color = |row: usize| Vec3::from(self.colors[row]);
-        let near = found.iter().map(|found| found.iter().map(|found| color(found.item as usize)).collect());
-        let near: Vec<Vec<Vec3>> = near.collect();
-        let usual = |(near, row): (&Vec<Vec3>, &usize)| {
-            let median = median(near).unwrap_or_default();
-            let apart = |color: &&Vec3| color.distance_squared(median);
-            near.iter()
-                .min_by(|a, b| apart(a).total_cmp(&apart(b)))
-                .map_or(self.colors[*row], |c| c.to_array())
-        };
-        near.par_iter().zip(rows).map(usual).collect()
-    }
 }
 
 /// The median of each channel; `None` without colours.
@@ -95,8 +72,8 @@ pub fn median(colors: &[Vec3]) -> Option<Vec3> {
 }
 
 /// Pseudo images of the sides' maps `[3, S, S]`: every valid pixel has the colour of the nearest valid point of the
-/// photographs `[3, S, S]`, or the most usual colour around this point, `is_usual`: pixels of a mask's rim may show the
-/// background. `points` `[V, S, S, 3]` are the points of all views.
+/// photographs `[3, S, S]`, or the most usual colour around this point's pixel, `is_usual`: pixels of a mask's rim may
+/// show the background. `points` `[V, S, S, 3]` are the points of all views.
 pub fn side_images(
     photos: [&[f32]; 2],
     points: &[f32],
@@ -105,76 +82,108 @@ pub fn side_images(
 ) -> Vec<Vec<f32>> {
     let area = valid[0].len();
     let points = points.as_chunks::<3>().0;
-    let point = |view: usize, i: usize| -> [f32; 3] { points[view * area + i] };
-    let seen = (0..2).flat_map(|view| {
-        let (photo, mask) = (photos[view], &valid[view]);
-        let color = move |i: usize| [photo[i], photo[area + i], photo[2 * area + i]];
-        (0..area).filter(|&i| mask[i]).map(move |i| (point(view, i), color(i)))
-    });
-    let cloud = Cloud::new(seen);
-    (2..valid.len()).map(|view| paint(cloud.as_ref(), |i| point(view, i), &valid[view], is_usual)).collect()
+    let seen = (0..2 * area).filter(|&i| valid[i / area][i % area] && Vec3::from(points[i]).is_finite());
+    let seen: Vec<usize> = seen.collect();
+    let cloud = Cloud::new(&seen.iter().map(|&i| points[i]).collect::<Vec<_>>());
+    let color = |i: usize| Vec3::from([0, 1, 2].map(|c| photos[i / area][c * area + i % area]));
+    let paint = |view: usize| {
+        let mut image = vec![EMPTY; 3 * area];
+        let Some(cloud) = &cloud else { return image };
+        let pixels: Vec<usize> = (0..area).filter(|&i| valid[view][i]).collect();
+        let queries: Vec<[f32; 3]> = pixels.iter().map(|&i| points[view * area + i]).collect();
+        let rows = cloud.nearest(&queries);
+        // Many pixels share a neighbour.
+        let mut used: Vec<usize> = rows.iter().flatten().copied().collect();
+        used.sort_unstable();
+        used.dedup();
+        let of_row = |&row: &usize| match is_usual {
+            true => usual_color(seen[row], points, valid, color),
+            false => color(seen[row]),
+        };
+        let colors: Vec<Vec3> = used.par_iter().map(of_row).collect();
+        for (i, row) in pixels.into_iter().zip(rows) {
+            let Some(place) = row.and_then(|row| used.binary_search(&row).ok()) else { continue };
+            for channel in 0..3 {
+                image[channel * area + i] = colors[place][channel];
+            }
+        }
+        image
+    };
+    (2..valid.len()).map(paint).collect()
 }
 
-fn paint(
-    cloud: Option<&Cloud>,
-    point: impl Fn(usize) -> [f32; 3],
-    valid: &[bool],
-    is_usual: bool,
-) -> Vec<f32> {
-    let area = valid.len();
-    let mut image = vec![EMPTY; 3 * area];
-    let Some(cloud) = cloud else { return image };
-    let pixels: Vec<usize> = (0..area).filter(|&i| valid[i]).collect();
-    let points: Vec<[f32; 3]> = pixels.iter().map(|&i| point(i)).collect();
-    let rows = cloud.nearest(&points);
-    // Many pixels share a neighbour.
-    let mut used: Vec<usize> = rows.iter().flatten().copied().collect();
-    used.sort_unstable();
-    used.dedup();
-    let colors = match is_usual {
-        true => cloud.usual_colors(&used),
-        false => used.iter().map(|row| cloud.colors[*row]).collect(),
-    };
-    for (&i, row) in pixels.iter().zip(rows) {
-        let Some(place) = row.and_then(|row| used.binary_search(&row).ok()) else { continue };
-        for (channel, value) in colors[place].into_iter().enumerate() {
-            image[channel * area + i] = value;
-        }
-    }
-    image
+/// The most usual colour of the surface around a photograph's pixel: of the colours of the pixels whose points are
+/// near its own, the one nearest to the median of each channel.
+fn usual_color(
+    pixel: usize,
+    points: &[[f32; 3]],
+    valid: &[Vec<bool>],
+    color: impl Fn(usize) -> Vec3,
+) -> Vec3 {
+    let area = valid[0].len();
+    let (view, side) = (pixel / area, area.isqrt());
+    let (x, y) = (pixel % area % side, pixel % area / side);
+    let around = |at: usize| (at.saturating_sub(REACH)..(at + REACH + 1).min(side)).step_by(STEP);
+    let point = |i: usize| Vec3::from(points[i]);
+    let near: Vec<Vec3> = around(y)
+        .flat_map(|y| around(x).map(move |x| y * side + x))
+        .filter(|&i| valid[view][i] && point(view * area + i).distance_squared(point(pixel)) <= NEAR * NEAR)
+        .map(|i| color(view * area + i))
+        .collect();
+    let median = median(&near).unwrap_or_default();
+    let apart = |color: &Vec3| color.distance_squared(median);
+    near.into_iter().min_by(|a, b| apart(a).total_cmp(&apart(b))).unwrap_or_else(|| color(pixel))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// The points of a line, each with its place as its colour.
     #[test]
     fn far_points_have_a_neighbour_near_the_nearest() {
-        let line = (0..100_000).map(|i| i as f32 * 1e-5);
-        let cloud = Cloud::new(line.map(|x| ([x, 0.0, 0.0], [x; 3]))).expect("points");
+        let line: Vec<[f32; 3]> = (0..100_000).map(|i| [i as f32 * 1e-5, 0.0, 0.0]).collect();
+        let cloud = Cloud::new(&line).expect("points");
         let found = cloud.nearest(&[[0.30001, 0.04, 0.0], [0.30001, 0.2, 0.0]]);
-        let found: Vec<f32> = found.into_iter().flatten().map(|row| cloud.colors[row][0]).collect();
+        let found: Vec<f32> = found.into_iter().flatten().map(|row| line[row][0]).collect();
         assert!((found[0] - 0.30001).abs() < 1e-6 && (found[1] - 0.30001).abs() <= 5e-5, "{found:?}");
-        // Neighbours' colours rise along the line. A speck has the colour of its surroundings.
-        let usual = cloud.usual_colors(&[50_000])[0][0];
-        assert!((usual - 0.5).abs() < 5e-4, "{usual}");
-        let mut specked = cloud;
-        specked.colors[50_000] = [9.0; 3];
-        let usual = specked.usual_colors(&[50_000])[0][0];
-        assert!((usual - 0.5).abs() < 5e-4, "{usual}");
+    }
+
+    #[test]
+    fn a_speck_has_the_color_of_its_surroundings() {
+        // A wall of 32² pixels, 2 mm apart, whose red rises to the right, with a blue speck and a far pixel beside it.
+        let (side, area, speck) = (32, 1024, 16 * 32 + 16);
+        let mut points: Vec<f32> =
+            (0..area).flat_map(|i| [i % side, i / side, 0].map(|v| v as f32 * 2e-3)).collect();
+        points[3 * (speck + 1) + 2] = 1.0;
+        let mut photo: Vec<f32> = (0..area).map(|i| (i % side) as f32 / 32.0).collect();
+        photo.extend(vec![0.0; 2 * area]);
+        for (channel, value) in [9.0, 9.0, -9.0].into_iter().enumerate() {
+            photo[channel * area + speck] = value;
+            photo[channel * area + speck + 1] = -value;
+        }
+        let (all, none) = (vec![true; area], vec![false; area]);
+        let mut asked = none.clone();
+        asked[speck] = true;
+        let points = [&points[..], &points, &points].concat();
+        let of = |is_usual: bool| {
+            let images =
+                side_images([&photo, &photo], &points, &[all.clone(), none.clone(), asked.clone()], is_usual);
+            assert_eq!(images[0][0], EMPTY);
+            [0, 1, 2].map(|c| images[0][c * area + speck])
+        };
+        assert_eq!(of(false), [9.0, 9.0, -9.0]);
+        let [red, green, blue] = of(true);
+        assert!((red - 0.5).abs() <= 1.0 / 32.0 && green == 0.0 && blue == 0.0, "{red} {green} {blue}");
     }
 
     #[test]
     fn identical_and_non_finite_points_do_no_harm() {
-        let same = std::iter::repeat_n(([1.0, 2.0, 3.0], [0.5; 3]), 5000);
-        let bad = [([f32::NAN, 0.0, 0.0], [0.0; 3]), ([f32::INFINITY; 3], [0.0; 3])];
-        let cloud = Cloud::new(bad.into_iter().chain(same)).expect("points");
-        assert_eq!(cloud.colors.len(), 5000);
+        let cloud = Cloud::new(&[[1.0, 2.0, 3.0]; 5000]).expect("points");
         let queries = [[1.0, 2.0, 3.1], [1e15; 3], [f32::NAN; 3], [f32::NEG_INFINITY; 3]];
         let found: Vec<bool> = cloud.nearest(&queries).iter().map(Option::is_some).collect();
         assert_eq!(found, [true, true, false, false]);
-        assert_eq!(cloud.usual_colors(&[7]), [[0.5; 3]]);
-        assert!(Cloud::new(bad.into_iter()).is_none());
+        // A photograph of points that are not finite colours nothing.
+        let images = side_images([&[0.5; 3]; 2], &[f32::NAN; 9], &vec![vec![true]; 3], true);
+        assert_eq!(images, [[EMPTY; 3]]);
     }
 }

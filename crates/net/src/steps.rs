@@ -12,117 +12,53 @@ use crate::window::Window;
 /// A step of a run, or one that was left out.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "step", rename_all = "kebab-case")]
+#[allow(missing_docs, reason = "the names say it")]
 pub enum Step {
-    /// The point predictor received the `window` of the canvas, reduced to `size` (width, height).
+    /// The point predictor received the `window` of a canvas of this side, reduced to `size` (width, height), as this
+    /// many tokens and channels of each photograph.
     PointPredictor {
-        /// Part of the canvas.
         window: Window,
-        /// Side of the canvas in pixels.
         canvas: usize,
-        /// Width and height of the network's input in pixels.
         size: [usize; 2],
         /// How the window was reduced.
         downsample: Downsample,
-        /// Tokens of each photograph.
         tokens: usize,
-        /// Channels of each photograph.
         channels: usize,
     },
     /// The network of details received both photographs in this size (width, height).
-    Details {
-        /// Width and height in pixels.
-        size: [usize; 2],
-    },
-    /// The network of details did not run: the canvas has fewer pixels than the network's image of it.
-    NoDetails {
-        /// Side of the canvas in pixels.
-        canvas: usize,
-    },
+    Details { size: [usize; 2] },
+    /// The network of details did not run: the canvas, of this side, has fewer pixels than the network's image of it.
+    NoDetails { canvas: usize },
     /// Pixels of the sides moved into the silhouettes.
-    MovedIntoSilhouettes {
-        /// Their number.
-        pixels: usize,
-    },
-    /// Pixels of a view that become Gaussians.
-    Chosen {
-        /// The view.
-        view: &'static str,
-        /// Their number.
-        pixels: usize,
-        /// Pixels of the canvas.
-        of: usize,
-    },
+    MovedIntoSilhouettes { pixels: usize },
+    /// Pixels of a view that become Gaussians, of all pixels of the canvas.
+    Chosen { view: &'static str, pixels: usize, of: usize },
     /// Pixels left out, since their points are not finite.
-    NotFinite {
-        /// Their number.
-        pixels: usize,
-    },
+    NotFinite { pixels: usize },
     /// Pixels of the sides left out, since they lie outside of the silhouettes.
-    OutsideSilhouettes {
-        /// Their number.
-        pixels: usize,
-    },
+    OutsideSilhouettes { pixels: usize },
     /// Pixels left out, since their points hang between two surfaces.
-    BetweenSurfaces {
-        /// Their number.
-        pixels: usize,
-    },
-    /// Colours of the sides were left out.
-    NoSideColors {
-        /// Whether the caller asked for this; otherwise there are no sides.
-        as_asked: bool,
-    },
-    /// The regressor received the `window` of some views.
-    Regressor {
-        /// The views.
-        views: &'static str,
-        /// Part of the canvas.
-        window: Window,
-        /// Side of the canvas in pixels.
-        canvas: usize,
-        /// The box around the person.
-        person: Window,
-    },
+    BetweenSurfaces { pixels: usize },
+    /// Colours of the sides were left out: `as_asked` by the caller, else since there are no sides.
+    NoSideColors { as_asked: bool },
+    /// The regressor received the `window` of some views of a canvas of this side, with this box around the person.
+    Regressor { views: &'static str, window: Window, canvas: usize, person: Window },
     /// The regressor did not run: no pixel of these views is valid.
-    NoRegressor {
-        /// The views.
-        views: &'static str,
-    },
+    NoRegressor { views: &'static str },
     /// Gaussians between the upper edges of front and back.
-    ClosedTop {
-        /// Their number.
-        gaussians: usize,
-    },
+    ClosedTop { gaussians: usize },
     /// All Gaussians.
-    Gaussians {
-        /// Their number.
-        gaussians: usize,
-    },
+    Gaussians { gaussians: usize },
     /// Gaussians left out, since their attributes are not finite.
-    GaussiansNotFinite {
-        /// Their number.
-        gaussians: usize,
-    },
+    GaussiansNotFinite { gaussians: usize },
     /// Gaussians left out, since they hang off the person's surface.
-    OffSurface {
-        /// Their number.
-        gaussians: usize,
-    },
+    OffSurface { gaussians: usize },
     /// Gaussians whose colours were corrected by the render of their photograph's view.
-    OwnColors {
-        /// Their number.
-        gaussians: usize,
-    },
+    OwnColors { gaussians: usize },
     /// Gaussians behind the surface.
-    Backing {
-        /// Their number.
-        gaussians: usize,
-    },
+    Backing { gaussians: usize },
     /// Several pairs of photographs were reconstructed. The other steps belong to the first pair.
-    Pairs {
-        /// Their number.
-        pairs: usize,
-    },
+    Pairs { pairs: usize },
 }
 
 impl fmt::Display for Step {

@@ -19,20 +19,13 @@ use crate::op::One;
 #[backend_extension(Cube, Flex, Autodiff)]
 pub trait RowsBackend: Backend {
     /// The `rows` `[M, C]` of a table `[N, C]`.
-    fn take(#[extension_type] table: One<Self>, rows: Arc<[i32]>) -> One<Self>;
+    fn take(#[extension_type] table: One<Self>, rows: Arc<[i32]>) -> One<Self> {
+        One { tensor: select::<Self>(table.tensor, &rows) }
+    }
 }
 
-macro_rules! untracked {
-    ($($backend:ty),+) => {
-        $(impl RowsBackend for $backend {
-            fn take(table: One<Self>, rows: Arc<[i32]>) -> One<Self> {
-                One { tensor: select::<Self>(table.tensor, &rows) }
-            }
-        })+
-    };
-}
-
-untracked!(CubeBackend, Flex);
+impl RowsBackend for CubeBackend {}
+impl RowsBackend for Flex {}
 
 fn select<B: Backend>(table: FloatTensor<B>, rows: &[i32]) -> FloatTensor<B> {
     let device = table.device();

@@ -16,7 +16,7 @@ use burn::tensor::{FloatDType, Tensor};
 use crate::device::{has_kernels, in_f32, is_bf16, is_tracked_on_gpu};
 use crate::gpu_convolution::convolve;
 use crate::op::{self, InputGradients, Kept, Kernel};
-use crate::operators::{Conv1x1, Conv3x3, Layer, LayerNorm, Linear, Unfolded, Wanted};
+use crate::operators::{Conv1x1, Conv3x3, Layer, LayerNorm, Linear, Unfolded};
 
 /// A linear layer: `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
@@ -180,9 +180,7 @@ impl<L: Layer> Kernel for Operator<L> {
         [of_input, of_weight, of_bias]: [bool; 3],
     ) -> InputGradients {
         let kept = kept.and_then(|kept| kept.downcast::<L::Kept>().ok()).expect("kept by the forward pass");
-        let wanted = Wanted { input: of_input, weight: of_weight, bias: of_bias && self.has_bias };
-        let gradients = self.layer.backward(x, weight, *kept, upstream, wanted);
-        [gradients.input, gradients.weight, gradients.bias]
+        self.layer.backward(x, weight, *kept, upstream, [of_input, of_weight, of_bias && self.has_bias])
     }
 }
 

@@ -86,31 +86,14 @@ fn in_f32([m, n, k]: [usize; 3], (lhs, ls): Matrix, (rhs, rs): Matrix, out: &mut
         |rows: usize, columns: usize, [column, row]: [usize; 2]| (rows - 1) * row + (columns - 1) * column;
     assert!(m > 0 && n > 0 && k > 0);
     assert!(last(m, k, ls) < lhs.len() && last(k, n, rs) < rhs.len() && m * n <= out.len());
-    let s = |x: usize| x as isize;
-    let keep = if add { 1.0 } else { 0.0 };
+    let [[lc, lr], [rc, rr]] = [ls, rs].map(|strides| strides.map(|stride| stride as isize));
+    let (lhs, rhs, out, row) = (lhs.as_ptr(), rhs.as_ptr(), out.as_mut_ptr(), n as isize);
+    let (keep, alone) = (if add { 1.0 } else { 0.0 }, gemm::Parallelism::None);
     // SAFETY: the assertions above bound every element that the strides reach; `out` is borrowed mutably.
     #[allow(unsafe_code, reason = "the matrix product of the gemm crate takes pointers")]
     unsafe {
         gemm::gemm(
-            m,
-            n,
-            k,
-            out.as_mut_ptr(),
-            1,
-            s(n),
-            add,
-            lhs.as_ptr(),
-            s(ls[0]),
-            s(ls[1]),
-            rhs.as_ptr(),
-            s(rs[0]),
-            s(rs[1]),
-            keep,
-            1.0,
-            false,
-            false,
-            false,
-            gemm::Parallelism::None,
+            m, n, k, out, 1, row, add, lhs, lc, lr, rhs, rc, rr, keep, 1.0, false, false, false, alone,
         );
     }
 }

@@ -22,20 +22,10 @@ enum Kind {
     Knit,
 }
 
-const KINDS: [Kind; 12] = [
-    Kind::Plain,
-    Kind::Stripes,
-    Kind::Hoops,
-    Kind::Checks,
-    Kind::Tartan,
-    Kind::Dots,
-    Kind::Zigzag,
-    Kind::Diamonds,
-    Kind::Camouflage,
-    Kind::Flowers,
-    Kind::Denim,
-    Kind::Knit,
-];
+const KINDS: [Kind; 12] = {
+    use Kind::*;
+    [Plain, Stripes, Hoops, Checks, Tartan, Dots, Zigzag, Diamonds, Camouflage, Flowers, Denim, Knit]
+};
 /// Kinds of most tops.
 const COMMON: [Kind; 5] = [Kind::Plain, Kind::Plain, Kind::Plain, Kind::Knit, Kind::Denim];
 /// Kinds of most trousers and shoes.
@@ -184,19 +174,9 @@ pub struct Print {
     size: f32,
 }
 
-/// Digits as 3 × 5 dots, rows from the top.
-const DIGITS: [[u8; 5]; 10] = [
-    [7, 5, 5, 5, 7],
-    [2, 6, 2, 2, 7],
-    [7, 1, 7, 4, 7],
-    [7, 1, 3, 1, 7],
-    [5, 5, 7, 1, 1],
-    [7, 4, 7, 1, 7],
-    [7, 4, 7, 5, 7],
-    [7, 1, 2, 2, 2],
-    [7, 5, 7, 5, 7],
-    [7, 5, 7, 1, 7],
-];
+/// Digits as 3 × 5 dots: rows from the top, one octal digit each.
+const DIGITS: [u16; 10] =
+    [0o75557, 0o26227, 0o71747, 0o71317, 0o55711, 0o74717, 0o74757, 0o71222, 0o75757, 0o75717];
 
 impl Print {
     /// A picture that contrasts with cloth of the colour `on`.
@@ -228,7 +208,7 @@ impl Print {
                 } else {
                     (number % 10, column as u32 - 4)
                 };
-                let lit = DIGITS[digit as usize][row as usize] >> (2 - dot) & 1 == 1;
+                let lit = DIGITS[digit as usize] >> (3 * (4 - row as u32) + 2 - dot) & 1 == 1;
                 if lit { first } else { color }
             }
             None => {

@@ -42,17 +42,12 @@ pub struct Doubt {
 /// What is wrong with photographs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "sign", rename_all = "kebab-case")]
+#[allow(missing_docs, reason = "the names say it")]
 pub enum Sign {
     /// The mask touches more borders of the picture than a person does.
-    TouchesBorders {
-        /// Number of touched borders.
-        borders: usize,
-    },
-    /// The person is wider than high.
-    Wide {
-        /// Width and height in pixels.
-        size: [u32; 2],
-    },
+    TouchesBorders { borders: usize },
+    /// The person is wider than high: width and height in pixels.
+    Wide { size: [u32; 2] },
     /// Both are one picture.
     Equal,
     /// One is the mirror image of the other.
@@ -60,10 +55,7 @@ pub enum Sign {
     /// The first shows the back, the second the front. They were exchanged.
     Swapped,
     /// Both show the same side.
-    SameSide {
-        /// The side.
-        facing: Facing,
-    },
+    SameSide { facing: Facing },
     /// The photograph shows the person from the side.
     FromTheSide,
     /// Nobody is recognised.
@@ -77,20 +69,11 @@ pub enum Sign {
     /// The mask leaves out a part of the torso.
     Hole,
     /// Parts of the body are outside of the picture.
-    Outside {
-        /// The parts.
-        parts: Vec<Part>,
-    },
+    Outside { parts: Vec<Part> },
     /// Limbs are elsewhere in the mirrored back.
-    Moved {
-        /// The limbs.
-        parts: Vec<Part>,
-    },
-    /// The silhouettes do not fit one another.
-    LittleOverlap {
-        /// Intersection over union.
-        overlap: f32,
-    },
+    Moved { parts: Vec<Part> },
+    /// The silhouettes do not fit one another: intersection over union.
+    LittleOverlap { overlap: f32 },
 }
 
 impl Sign {

@@ -205,23 +205,17 @@ pub struct Person {
 
 /// No person came out of photographs.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the names say it")]
 pub enum NoPerson {
-    /// The networks made no Gaussian.
+    /// The networks made no Gaussian in these steps.
     #[error("no Gaussian came out of these photographs")]
-    Empty {
-        /// The steps of the networks.
-        steps: Vec<Step>,
-    },
-    /// The person would be far too tall for its width.
+    Empty { steps: Vec<Step> },
+    /// The person would be far too tall for its width, with a camera at this distance in metres that looks down by
+    /// `elevation` degrees.
     #[error(
         "a camera {distance:.2} m away that looks down by {elevation:.0}° cannot have taken these photographs: check --distance and --elevation"
     )]
-    Camera {
-        /// Distance of the camera in metres.
-        distance: f64,
-        /// How far it looks down, in degrees.
-        elevation: f64,
-    },
+    Camera { distance: f64, elevation: f64 },
 }
 
 /// Makes the person in a front and a back photograph, restored to the real cameras. The person stands on y = 0 and has

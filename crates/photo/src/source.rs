@@ -6,21 +6,16 @@ use image::{DynamicImage, GrayImage, RgbImage};
 use snapsnap_base::FileError;
 use snapsnap_mesh::picture;
 
-/// Placement of a photograph on its canvas.
+/// Placement of a photograph on its canvas. Heights are the person's, in pixels of a canvas of 1024.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the names say it")]
 pub enum Placement {
     /// The picture is the canvas.
     AsIs,
     /// The person's box is resized with antialiasing, to the place of the training subjects.
-    Training {
-        /// Height of the person in pixels of a canvas of 1024.
-        height: usize,
-    },
+    Training { height: usize },
     /// As in the published demo: centred, resized without antialiasing, and valid only for pixels with a full mask.
-    Demo {
-        /// Height of the person in pixels of a canvas of 1024.
-        height: usize,
-    },
+    Demo { height: usize },
 }
 
 /// What separates the person from the background.

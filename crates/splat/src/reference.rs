@@ -67,33 +67,24 @@ impl<const K: usize> Dual<K> {
     }
 }
 
-impl<const K: usize> Add for Dual<K> {
-    type Output = Self;
-    fn add(self, other: Self) -> Self {
-        self.with(other, self.value + other.value, 1.0, 1.0)
-    }
+/// Operators: the value for operands of the values a and b, and its derivatives with respect to a and b.
+macro_rules! operators {
+    ($($operator:ident $name:ident |$a:ident, $b:ident| $value:expr, $by_a:expr, $by_b:expr;)*) => {$(
+        impl<const K: usize> $operator for Dual<K> {
+            type Output = Self;
+            fn $name(self, other: Self) -> Self {
+                let ($a, $b) = (self.value, other.value);
+                self.with(other, $value, $by_a, $by_b)
+            }
+        }
+    )*};
 }
 
-impl<const K: usize> Sub for Dual<K> {
-    type Output = Self;
-    fn sub(self, other: Self) -> Self {
-        self.with(other, self.value - other.value, 1.0, -1.0)
-    }
-}
-
-impl<const K: usize> Mul for Dual<K> {
-    type Output = Self;
-    fn mul(self, other: Self) -> Self {
-        self.with(other, self.value * other.value, other.value, self.value)
-    }
-}
-
-impl<const K: usize> Div for Dual<K> {
-    type Output = Self;
-    fn div(self, other: Self) -> Self {
-        let quotient = self.value / other.value;
-        self.with(other, quotient, 1.0 / other.value, -quotient / other.value)
-    }
+operators! {
+    Add add |a, b| a + b, 1.0, 1.0;
+    Sub sub |a, b| a - b, 1.0, -1.0;
+    Mul mul |a, b| a * b, b, a;
+    Div div |a, b| a / b, 1.0 / b, -(a / b) / b;
 }
 
 impl<const K: usize> Neg for Dual<K> {

@@ -26,14 +26,8 @@ pub enum TrainError {
     /// Another rank cannot continue. The message has its number, its machine and its error.
     #[error("{0}")]
     Elsewhere(String),
-    /// Too many failed steps in a row.
+    /// Too many failed steps in a row. `why` has the last one's error and samples.
     #[error("{count} steps in a row could not be made; the last was step {step}: {why}")]
-    Stuck {
-        /// Steps in a row.
-        count: u64,
-        /// The last one.
-        step: u64,
-        /// Its error and its samples.
-        why: String,
-    },
+    #[allow(missing_docs, reason = "the names say it")]
+    Stuck { count: u64, step: u64, why: String },
 }

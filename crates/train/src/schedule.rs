@@ -16,23 +16,17 @@ const END: f64 = 0.01;
 /// A schedule as a share of the highest rate: the section `[schedule]`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+#[allow(missing_docs, reason = "the names say it")]
 pub enum Schedule {
     /// PyTorch's `OneCycleLR` with cosine annealing, as in the published code
     /// (docs/method.md, "Optimisation and schedules").
     OneCycle {},
-    /// A linear rise, then half a cosine.
-    Cosine {
-        /// Steps in which the rate rises.
-        warm_up: usize,
-    },
-    /// A linear rise, the highest rate, and a linear fall ("warmup-stable-decay"). While the rate is constant, it does
-    /// not depend on the number of steps, so that a run's end can be set later.
-    Trapezoid {
-        /// Steps in which the rate rises.
-        warm_up: usize,
-        /// Last steps, in which the rate falls.
-        fall: usize,
-    },
+    /// A linear rise of `warm_up` steps, then half a cosine.
+    Cosine { warm_up: usize },
+    /// A linear rise of `warm_up` steps, the highest rate, and a linear fall in the last `fall` steps
+    /// ("warmup-stable-decay"). While the rate is constant, it does not depend on the number of steps, so that a run's
+    /// end can be set later.
+    Trapezoid { warm_up: usize, fall: usize },
 }
 
 impl Default for Schedule {

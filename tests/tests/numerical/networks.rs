@@ -9,7 +9,7 @@ use snapsnap_base::config::Schema;
 use snapsnap_net::config::{Config, Precision};
 use snapsnap_net::network::{Decoded, Encoded, Input, PointPredictor, View, activate};
 use snapsnap_net::regressor::Attributes;
-use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
+use snapsnap_net::weights::{ImportOptions, WeightFile, import};
 use snapsnap_tests::{Numbers, assert_close, device, fixture, toml_config};
 
 const TOKENS: f64 = 1e-5;
@@ -23,7 +23,7 @@ fn config(folder: &Path) -> Config {
 
 fn predictor(folder: &Path, config: &Config, device: &Device) -> PointPredictor {
     let file = tempfile::NamedTempFile::new().expect("temporary file");
-    let options = ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 0, float: Precision::F32 };
+    let options = ImportOptions { fill: None, seed: 0, float: Precision::F32 };
     let names = ["weights.safetensors", "stage1.pth"];
     let weights =
         names.map(|name| folder.join(name)).into_iter().find(|path| path.exists()).expect("weights");
@@ -102,7 +102,7 @@ fn gaussian_regressor_and_its_activations() {
     let folder = fixture("unet");
     let Some(device) = device() else { return };
     let file = tempfile::NamedTempFile::new().expect("temporary file");
-    let options = ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 0, float: Precision::F32 };
+    let options = ImportOptions { fill: None, seed: 0, float: Precision::F32 };
     import(&[folder.join("weights.safetensors")], &Config::default(), options, file.path(), &|_, _| ())
         .expect("import");
     let regressors =

@@ -7,7 +7,7 @@ use snapsnap_base::config::Schema;
 use snapsnap_net::Prediction;
 use snapsnap_net::config::{Config, Precision};
 use snapsnap_net::steps::Record;
-use snapsnap_net::weights::{ImportOptions, SideHeads, WeightFile, import};
+use snapsnap_net::weights::{ImportOptions, WeightFile, import};
 use snapsnap_tests::{
     FIXTURE_VALUES, Numbers, data, device, fixture, is_software, relative_error, start_error, toml_config,
     values,
@@ -33,7 +33,7 @@ fn predictor(device: &Device) -> (Config, Networks) {
     let delta = "network.delta=1.7".to_owned();
     let config = Config::from_toml(&text, "the fixture's config", &[delta]).expect("a config");
     let path = folder.path().join("weights.safetensors");
-    let options = ImportOptions { fill: None, side_heads: SideHeads::Seed, seed: 0, float: Precision::F32 };
+    let options = ImportOptions { fill: None, seed: 0, float: Precision::F32 };
     import(&[data("pipeline/stage1.pth")], &config, options, &path, &|_, _| ()).expect("imports");
     let weights = WeightFile::open(&path, None).expect("opens");
     let predictor = weights.point_predictor(&device.clone().autodiff()).expect("loads");

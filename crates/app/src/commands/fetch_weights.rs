@@ -1,7 +1,7 @@
 //! `snapsnap fetch-weights`: downloads published weights and checks their SHA-256.
 
 use std::fs::{self, File, TryLockError};
-use std::io::{self, Read, Seek, Write};
+use std::io::{self, ErrorKind, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -163,7 +163,7 @@ fn copy(item: &Item, folder: &Path, path: &Path) -> Result<(), Failure> {
         out.flush()?;
         check_sum(item, &from.display().to_string(), out.get_mut())
     });
-    written.map_err(|broken| broken.failure(path))
+    written.map_err(|e| broken(path, &e))
 }
 
 /// Downloads a file into `FILE.part`, which is renamed once its sum is right.
@@ -186,10 +186,10 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
         let _ = fs::remove_file(&part);
     }
     filled?;
-    check_sum(item, address, &mut file).map_err(|broken| {
+    check_sum(item, address, &mut file).map_err(|e| {
         // A later run must not continue from wrong bytes.
         let _ = fs::remove_file(&part);
-        broken.failure(&part)
+        broken(&part, &e)
     })?;
     file::rename(&part, path).map_err(|e| Failure::cannot_write(path, &e))
 }
@@ -205,38 +205,26 @@ fn is_shared(_: &fs::Metadata) -> bool {
     false
 }
 
-/// Why a file is not the published one.
-enum Broken {
-    Content(String),
-    File(io::Error),
-}
-
-impl Broken {
-    fn failure(self, path: &Path) -> Failure {
-        match self {
-            Self::Content(message) => Failure::Input(message),
-            Self::File(e) => Failure::cannot_write(path, &e),
-        }
+/// Why a file was not written.
+fn broken(path: &Path, e: &io::Error) -> Failure {
+    match e.kind() {
+        ErrorKind::InvalidData => Failure::Input(e.to_string()),
+        _ => Failure::cannot_write(path, e),
     }
 }
 
-impl From<io::Error> for Broken {
-    fn from(e: io::Error) -> Self {
-        Self::File(e)
-    }
-}
-
-/// Checks the size and the sum of a written file.
-fn check_sum(item: &Item, origin: &str, file: &mut File) -> Result<(), Broken> {
+/// Checks the size and the sum of a written file. The wrong content is [`ErrorKind::InvalidData`].
+fn check_sum(item: &Item, origin: &str, file: &mut File) -> io::Result<()> {
     file.rewind()?;
     let (found, length) = (sha256(file)?, file.metadata()?.len());
     if found == item.sha256 && length == item.bytes {
         return Ok(());
     }
-    Err(Broken::Content(format!(
+    let message = format!(
         "{origin}: the content is not that of {}: {length} bytes with SHA-256 {found}; nothing was kept",
         item.file
-    )))
+    );
+    Err(io::Error::new(ErrorKind::InvalidData, message))
 }
 
 /// Lets curl download the rest of an unfinished file, in several attempts if connections break.
@@ -253,17 +241,8 @@ fn fill(file: &mut File, part: &Path, item: &Item, address: &str) -> Result<(), 
         let limit = item.bytes.to_string();
         let mut curl = Command::new("curl");
         curl.args(["--fail", "--location", "--show-error", meter, "--connect-timeout", "60"]);
-        curl.args([
-            "--speed-limit",
-            "1",
-            "--speed-time",
-            "60",
-            "--max-filesize",
-            &limit,
-            "--continue-at",
-            "-",
-        ]);
-        curl.arg("--output").arg(part).args(["--", address]);
+        curl.args(["--speed-limit", "1", "--speed-time", "60", "--max-filesize", &limit]);
+        curl.args(["--continue-at", "-", "--output"]).arg(part).args(["--", address]);
         let ended = curl.stdin(Stdio::null()).stdout(Stdio::null()).status().map_err(|e| {
             let advice = format!("fetch {address} by other means, and give its folder with --from");
             Failure::Internal(format!("cannot run curl: {e}; install curl, or {advice}"))

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_net::config::{Config, Precision};
-use snapsnap_net::weights::{self, ImportOptions, SideHeads};
+use snapsnap_net::weights::{self, ImportOptions};
 
-use crate::arguments::{ConfigArguments, one_of};
+use crate::arguments::ConfigArguments;
 use crate::failure::Failure;
 use crate::output::check_outputs;
 use crate::progress::Progress;
@@ -15,10 +15,6 @@ use crate::say;
 
 /// Name of the default config.
 const PUBLISHED: &str = "the published size";
-const SIDE_HEADS: [(&str, &str, SideHeads); 2] = [
-    ("seed", "Drawn from --seed, as the authors do", SideHeads::Seed),
-    ("copy", "Copied: right from front, left from back", SideHeads::Copy),
-];
 
 #[derive(Args)]
 pub struct InitArguments {
@@ -43,9 +39,6 @@ pub struct ImportArguments {
     fill: Option<PathBuf>,
     #[command(flatten)]
     config: ConfigArguments,
-    /// Source of the right and left heads if no checkpoint contains them.
-    #[arg(long, value_parser = one_of(SIDE_HEADS), default_value = "seed")]
-    side_heads: SideHeads,
     /// Seed of the tensors that no checkpoint has.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -84,12 +77,7 @@ pub fn import(arguments: &ImportArguments) -> Result<(), Failure> {
         sources.iter().chain(fill).chain(&arguments.config.config).map(PathBuf::as_path).collect();
     check_outputs(&[output], &inputs)?;
     let float = if arguments.half { Precision::F16 } else { Precision::F32 };
-    let options = ImportOptions {
-        fill: fill.as_deref(),
-        side_heads: arguments.side_heads,
-        seed: arguments.seed,
-        float,
-    };
+    let options = ImportOptions { fill: fill.as_deref(), seed: arguments.seed, float };
     let progress = Progress::bytes();
     let advance = |done, total| progress.advance(done, total);
     let report = weights::import(sources, &config, options, output, &advance)?;

@@ -9,8 +9,9 @@ use rayon::prelude::*;
 use super::consistency::{LEAST_SIDE, Seen, disagreements};
 use super::views::split_alpha;
 use super::write::UNFINISHED;
-use super::{Arrangement, DepthMap, Description, Folder, Layout, Person, Split, names};
+use super::{Arrangement, DepthMap, Description, Folder, Layout, Person, Split, name};
 use snapsnap_base::FileError;
+use snapsnap_base::folder::entries;
 
 /// Largest share of the person without depth. Scans have gaps narrower than a pixel.
 const HOLES: f64 = 0.01;
@@ -78,10 +79,11 @@ fn orphans(folder: &Folder, split: Option<Split>, subjects: &[String]) -> Vec<St
     let mut problems = Vec::new();
     for kind in folder.kinds().iter().filter(|kind| **kind != "img") {
         let path = folder.split_path(split).join(kind);
-        for (name, _) in names(&path).unwrap_or_default() {
+        for path in entries(&path).unwrap_or_default() {
+            let name = name(&path);
             let subject = name.strip_suffix(".json").unwrap_or(&name).to_owned();
             if !subjects.contains(&subject) {
-                problems.push(format!("{}: its subject has no pictures", path.join(name).display()));
+                problems.push(format!("{}: its subject has no pictures", path.display()));
             }
         }
     }
@@ -94,11 +96,10 @@ fn unexpected(folder: &Folder, person: Person<'_>) -> Vec<String> {
     let views = folder.description().views;
     let mut extra = BTreeSet::new();
     for kind in folder.kinds().iter().filter(|kind| **kind != "cameras") {
-        let path = person.path(kind);
-        for (name, _) in names(&path).unwrap_or_default() {
-            let number: String = name.chars().take_while(char::is_ascii_digit).collect();
+        for path in entries(&person.path(kind)).unwrap_or_default() {
+            let number: String = name(&path).chars().take_while(char::is_ascii_digit).collect();
             if !number.parse().is_ok_and(|view: usize| view < views) {
-                extra.insert(format!("{}: belongs to none of the {views} views", path.join(name).display()));
+                extra.insert(format!("{}: belongs to none of the {views} views", path.display()));
             }
         }
     }

@@ -109,7 +109,6 @@ pub struct Description {
     /// Source of the subjects.
     pub source: String,
     /// Sampling and cameras of the renders, if known.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub drawn: Option<Drawn>,
 }
 

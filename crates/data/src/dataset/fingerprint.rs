@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
+use snapsnap_base::folder::entries;
 use snapsnap_base::{FileError, file};
 
-use super::{Folder, Split, names};
+use super::{Folder, Split};
 
 /// Bytes that are read at the beginning and at the end of a file. A PNG and a compressed array end with checksums of
 /// their content.
@@ -48,10 +49,8 @@ impl Folder {
 
 /// Adds the files below a folder. Hidden files are unfinished, and left out.
 fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<(), FileError> {
-    for (name, is_folder) in names(folder).map_err(FileError::read(folder))? {
-        let path = folder.join(&name);
-        match is_folder {
-            _ if name.starts_with('.') => {}
+    for path in entries(folder)? {
+        match path.is_dir() {
             false => files.push(path),
             true if depth > 1 => list(&path, depth - 1, files)?,
             true => {}

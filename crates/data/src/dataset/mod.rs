@@ -26,9 +26,9 @@ mod write;
 
 use std::fmt::Display;
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 
+use snapsnap_base::folder::entries;
 use snapsnap_base::{FileError, file};
 
 pub use check::{Checked, check};
@@ -157,11 +157,7 @@ impl Folder {
     /// [`FileError::Read`] for a missing split.
     pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, FileError> {
         let folder = self.split_path(split).join("img");
-        let names = names(&folder).map_err(FileError::read(&folder))?;
-        let folders = names.into_iter().filter(|(name, is_folder)| *is_folder && !name.starts_with('.'));
-        let mut subjects: Vec<String> = folders.map(|(name, _)| name).collect();
-        subjects.sort_unstable();
-        Ok(subjects)
+        Ok(entries(&folder)?.iter().filter(|path| path.is_dir()).map(|path| name(path)).collect())
     }
 
     /// Reads a file of the data set.
@@ -195,19 +191,14 @@ impl Folder {
     }
 }
 
-/// Names in a folder, and whether they are folders.
-fn names(folder: &Path) -> io::Result<Vec<(String, bool)>> {
-    let entry = |entry: io::Result<fs::DirEntry>| {
-        let entry = entry?;
-        Ok((entry.file_name().to_string_lossy().into_owned(), entry.path().is_dir()))
-    };
-    fs::read_dir(folder)?.map(entry).collect()
+/// The last part of a path.
+fn name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 /// The number after the last underscore of the folder's name.
 fn views_in_name(root: &Path) -> Option<usize> {
-    let name = root.canonicalize().unwrap_or_else(|_| root.to_owned());
-    let name = name.file_name()?.to_string_lossy().into_owned();
+    let name = name(&root.canonicalize().unwrap_or_else(|_| root.to_owned()));
     let (_, views) = name.rsplit_once('_')?;
     views.parse().ok().filter(|views| (1..=MAX_VIEWS).contains(views))
 }

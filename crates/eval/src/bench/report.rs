@@ -164,19 +164,9 @@ impl Bench<'_> {
                     m.gaussians.to_string(),
                 ]
             };
-            let header = [
-                "left out",
-                "time, ms",
-                "saved",
-                "memory, MB",
-                "saved",
-                "PSNR, dB",
-                "lost",
-                "front, back, mm",
-                "more",
-                "Gaussians",
-            ];
-            let table = table_markdown(&header, of_scene().map(row));
+            let header =
+                "left out|time, ms|saved|memory, MB|saved|PSNR, dB|lost|front, back, mm|more|Gaussians";
+            let table = table_markdown(&Vec::from_iter(header.split('|')), of_scene().map(row));
             let _ = write!(text, "\n## Scene: {}\n\n{table}", escaped(scene));
             for m in of_scene() {
                 let (omits, plan) = (m.omits.as_deref().unwrap_or("nothing"), m.plan.join("; "));

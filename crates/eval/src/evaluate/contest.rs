@@ -12,14 +12,12 @@ use super::baselines::{billboard, true_points};
 use super::config::{MetricsSection, ViewsSection};
 use super::model::{Model, no_gaussian};
 use super::person::{People, Points, nearest_view, photograph, points};
-use super::shared::rendered;
 use super::sides::side_points;
 use super::surface::Truth;
 use crate::EvalError;
 use crate::foreign::Palette;
 use crate::geometry::{ALIGNED, Align, double, icp, opaque_centres, thinned};
 use crate::parts::{PartError, part_errors};
-use crate::pictures::Picture;
 use crate::points::{Pair, PointError, point_errors};
 
 /// Azimuths of the right and the left side, degrees from the first photograph.
@@ -166,20 +164,6 @@ impl Contestant {
                 plain(true_points(&photographs, &points, &valid, canvas, front, device))
             }
         }
-    }
-
-    /// The contestant's picture of a view, `side`² pixels.
-    ///
-    /// # Errors
-    /// [`EvalError`] for Gaussians that cannot be rendered.
-    pub(super) fn picture(
-        &self,
-        shown: &Shown,
-        camera: &Camera,
-        side: usize,
-        views: &ViewsSection,
-    ) -> Result<Picture, EvalError> {
-        rendered(&shown.gaussians, camera, side, &self.views(views))
     }
 }
 

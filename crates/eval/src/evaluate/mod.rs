@@ -283,7 +283,8 @@ impl Place<'_> {
             let shown = shown.as_ref()?;
             let score = |image: &Picture, region| Score::new(image, &target, region, self.lpips);
             let judged = || {
-                let image = self.contestants[i].picture(shown, camera, side, &config.views)?;
+                let views = self.contestants[i].views(&config.views);
+                let image = rendered(&shown.gaussians, camera, side, &views)?;
                 let scores = regions.iter().map(|region| score(&image, region)).collect::<Result<_, _>>()?;
                 let palette = shown.palette.as_ref().zip(around.as_ref());
                 let traces = palette.map(|(palette, region)| palette.traces(&image, &target, &mask, region));
@@ -341,7 +342,8 @@ fn pictures(
     }
     for wanted in &config.report.degrees {
         let view = person::nearest_view(&item.cameras, inputs[0], *wanted);
-        let image = contestant.picture(&shown, &item.cameras[view], side, &config.views)?;
+        let views = contestant.views(&config.views);
+        let image = rendered(&shown.gaussians, &item.cameras[view], side, &views)?;
         let (target, _) = people.target(row, view, side)?;
         let window = Region::paper(&target)?.window;
         let [image, target] = [image, target].map(|picture| picture.cropped(window));

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use burn::tensor::{Device, Tensor, TensorData};
 use glam::DVec3;
 use snapsnap_base::FileError;
-use snapsnap_data::dataset::{Arrangement, Folder, Split};
+use snapsnap_data::dataset::{Arrangement, Folder};
 use snapsnap_data::sample::{PhotographChanges, Test, TestItem};
 use snapsnap_net::Photograph;
 use snapsnap_net::config::Downsample;
@@ -37,9 +37,12 @@ impl People {
     /// [`EvalError`] if the folder is no data set, or does not have the views of the config.
     pub fn open(path: &Path, data: &DataSection, views: &ViewsSection) -> Result<Self, EvalError> {
         let folder = Arc::new(Folder::open(path)?);
-        let test = test_of(&folder, data.split)?;
-        let description = folder.description();
         let wrong = |message: &str| EvalError::File(FileError::unsuitable(path, message));
+        if let Some(split) = data.split.filter(|split| !folder.splits().contains(&Some(*split))) {
+            return Err(wrong(&format!("has no split `{split}`: change `data.split`")));
+        }
+        let test = Test::new(folder.clone(), data.split)?;
+        let description = folder.description();
         let count = description.views;
         if description.arrangement != Arrangement::Ring {
             return Err(wrong("is arranged in groups, for training: test people need a ring of views"));
@@ -114,18 +117,6 @@ impl People {
         let picture = Picture::new(values, [side, side], "true picture")?;
         Ok((picture, smaller(mask, 1, stored, side)))
     }
-}
-
-/// The test samples of a split, with unchanged photographs.
-///
-/// # Errors
-/// [`EvalError::File`] if the data set has no such split.
-pub fn test_of(folder: &Arc<Folder>, split: Option<Split>) -> Result<Test, EvalError> {
-    if let Some(split) = split.filter(|split| !folder.splits().contains(&Some(*split))) {
-        let message = format!("has no split `{split}`: change `data.split`");
-        return Err(EvalError::File(FileError::unsuitable(folder.root(), message)));
-    }
-    Ok(Test::new(folder.clone(), split)?)
 }
 
 /// The largest divisor of a side up to `most`.

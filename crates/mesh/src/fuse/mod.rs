@@ -78,14 +78,11 @@ pub enum FuseError {
     /// Too few Gaussians for the size of the body, or too large ones.
     #[error("no surface: the Gaussians are too large beside the distances between their centres")]
     Coarse,
-    /// A body that is far from a person's size or place.
+    /// A body that is far from a person's size or place: longest side of its box, and the box's distance from the
+    /// origin, metres.
     #[error("no surface: a body of {length:.1e} m, {distance:.1e} m from the origin: scale or move it")]
-    Foreign {
-        /// Longest side of the body's box, metres.
-        length: f32,
-        /// Distance of the box's centre from the origin, metres.
-        distance: f32,
-    },
+    #[allow(missing_docs, reason = "the names say it")]
+    Foreign { length: f32, distance: f32 },
     /// Too much work.
     #[error("{0}: this would take longer than {LONG} s on a few cores")]
     Long(String),

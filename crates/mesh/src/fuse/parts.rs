@@ -65,20 +65,12 @@ impl Grid {
                 begin(number, &mut from, &mut front);
             }
         }
-        ways.into_iter().for_each(|row| self.thicken(row));
-        joined
-    }
-
-    /// Moves a corner that is not on the border, and its 26 neighbours, inside.
-    fn thicken(&mut self, row: usize) {
-        let [x, y, z] = self.strides();
-        for plane in [row - z, row, row + z] {
-            for line in [plane - y, plane, plane + y] {
-                for at in [line - x, line, line + x] {
-                    self.values[at] = self.values[at].min(-0.5 * self.cell);
-                }
+        for row in ways {
+            for at in self.around_corner(row, 1) {
+                self.values[at] = self.values[at].min(-0.5 * self.cell);
             }
         }
+        joined
     }
 }
 

@@ -7,7 +7,7 @@ use std::slice;
 
 use super::WeightsError;
 use super::file::{Progress, WeightFile, mismatch, parts_of, write, write_tensors};
-use super::init::{SideHeads, draw};
+use super::init::draw;
 use super::schema::{self, DETAILS, DUST3R, Part, SCALE, SIDE, TensorSpec, UNET};
 use super::source::{CONFIG_KEY, Source};
 use crate::config::{Config, Precision};
@@ -17,8 +17,6 @@ use crate::config::{Config, Precision};
 pub struct ImportOptions<'a> {
     /// A checkpoint that gives the tensors which are in none of the others.
     pub fill: Option<&'a Path>,
-    /// Where side heads come from when the checkpoints have none.
-    pub side_heads: SideHeads,
     /// Seed of random values.
     pub seed: u64,
     /// Float type of the written file.
@@ -142,7 +140,7 @@ pub fn import(
         let path = fill.path().display();
         report.notes.push(format!("{count} tensors are in none of the others: from {path}"));
     }
-    let plan = plan(&specs, found, (options, lacks_heads), &mut problems, &mut report);
+    let plan = plan(&specs, found, (options.seed, lacks_heads), &mut problems, &mut report);
     if !problems.is_empty() {
         return Err(WeightsError::Tensors { origin, problems });
     }
@@ -176,20 +174,15 @@ fn head(k: usize) -> String {
 fn plan<'a>(
     specs: &[TensorSpec],
     mut found: Found<'a>,
-    (options, lacks_heads): (ImportOptions<'_>, bool),
+    (seed, lacks_heads): (u64, bool),
     problems: &mut Vec<String>,
     report: &mut ImportReport,
 ) -> Vec<Option<Place<'a>>> {
     let wanted = |k: &usize| specs.iter().any(|spec| spec.name.starts_with(&head(*k)));
     let given = |k: &usize| found.keys().any(|key| key.starts_with(&head(*k)));
     let absent: Vec<usize> = (1..=4).filter(|k| lacks_heads && wanted(k) && !given(k)).collect();
-    for &k in &absent {
-        report.notes.push(match options.side_heads {
-            SideHeads::Copy if k > 2 && !absent.contains(&(k - 2)) => {
-                format!("head {k} is in no file: copied from head {}", k - 2)
-            }
-            _ => format!("head {k} is in no file: drawn from seed {}", options.seed),
-        });
+    for k in &absent {
+        report.notes.push(format!("head {k} is in no file: drawn from seed {seed}"));
     }
 
     let mut plan: Vec<Option<Place>> = Vec::new();
@@ -199,19 +192,6 @@ fn plan<'a>(
             (Some((source, key)), _) => {
                 problems.extend(mismatch(spec, &source.tensors()[&key], source.path()));
                 Some((source, key))
-            }
-            (None, Some(&k)) if k > 2 && options.side_heads == SideHeads::Copy => {
-                let twin = spec.name.replace(&head(k), &head(k - 2));
-                let at = specs.iter().position(|s| s.name == twin).expect("heads have the same tensors");
-                if specs[at].shape == spec.shape {
-                    plan[at].clone()
-                } else {
-                    problems.push(format!(
-                        "cannot copy: {} needs {:?}, {twin} has {:?} (fusion = \"concat\" doubles the side heads' inputs)",
-                        spec.name, spec.shape, specs[at].shape
-                    ));
-                    None
-                }
             }
             (None, Some(_)) => None,
             (None, None) if spec.name == SCALE => {

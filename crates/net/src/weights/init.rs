@@ -11,15 +11,6 @@ use super::file::{Progress, write};
 use super::schema::{self, Init, TensorSpec};
 use crate::config::{Config, Precision};
 
-/// Where the side heads come from when a checkpoint has none.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SideHeads {
-    /// Drawn from the seed, as the authors do.
-    Seed,
-    /// Right copied from front, left from back.
-    Copy,
-}
-
 /// Initial values of one tensor. Every tensor has a random stream of its own, chosen by its name, so that its values
 /// do not depend on which other tensors are drawn.
 pub(super) fn draw(spec: &TensorSpec, seed: u64) -> Vec<f32> {

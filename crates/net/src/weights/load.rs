@@ -90,32 +90,24 @@ struct Loader<'a> {
     failure: Option<WeightsError>,
 }
 
-impl Loader<'_> {
-    fn read<const D: usize>(&mut self, name: &str) -> Option<Tensor<D>> {
-        let (values, mut shape) = match (self.source)(name) {
+impl NamedMapper for Loader<'_> {
+    fn map<const D: usize>(&mut self, path: &ParameterPath, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let (name, expected) = (path.name(), param.lazy_shape());
+        let (values, mut shape) = match (self.source)(&name) {
             Ok(read) => read,
             Err(e) => {
                 self.failure.get_or_insert(e);
-                return None;
+                return param;
             }
         };
-        if let Some(problem) = not_finite(name, &values) {
+        if let Some(problem) = not_finite(&name, &values) {
             self.problems.push(problem);
-            return None;
+            return param;
         }
         if shape.is_empty() {
             shape.push(1); // δ is a scalar in the file and [1] here
         }
-        Some(Tensor::from_data(TensorData::new(values, shape), self.device))
-    }
-}
-
-impl NamedMapper for Loader<'_> {
-    fn map<const D: usize>(&mut self, path: &ParameterPath, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-        let (name, expected) = (path.name(), param.lazy_shape());
-        let Some(tensor) = self.read::<D>(&name) else {
-            return param;
-        };
+        let tensor = Tensor::<D>::from_data(TensorData::new(values, shape), self.device);
         let tensor = if path.is_transposed() { tensor.swap_dims(0, 1) } else { tensor };
         assert_eq!(tensor.shape(), expected, "{name}: schema and network disagree");
         let id = param.id;

@@ -17,7 +17,7 @@ use snapsnap_base::config::ConfigError;
 pub use crate::parameters::{NamedMapper, NamedVisitor, ParameterPath, map_named, visit_named};
 pub use file::{Progress, WeightFile, not_finite, save, write_tensors};
 pub use import::{ImportOptions, ImportReport, export, import, stored_config};
-pub use init::{SideHeads, init};
+pub use init::init;
 pub use load::{random_predictor, random_regressors};
 pub use source::{Entry, Source};
 
@@ -50,14 +50,10 @@ pub enum WeightsError {
     #[error(transparent)]
     File(#[from] FileError),
     /// Tensors are missing, unused, mis-shaped, of the wrong type, not finite or given twice. A problem is its kind, a
-    /// colon and the tensor.
+    /// colon and the tensor, one line each.
     #[error("{origin}: {} problem(s) with the weights:\n  {}", .problems.len(), listed(.problems))]
-    Tensors {
-        /// File or files.
-        origin: String,
-        /// One line per tensor.
-        problems: Vec<String>,
-    },
+    #[allow(missing_docs, reason = "the names say it")]
+    Tensors { origin: String, problems: Vec<String> },
     /// The config in a file's metadata, or beside it.
     #[error(transparent)]
     Config(#[from] ConfigError),

@@ -4,9 +4,10 @@
 use rayon::prelude::*;
 
 use super::elements::{add_constant, mask, rectify, total};
-use super::{Gradients, Layer, Wanted, join};
+use super::{Layer, join};
 use crate::buffers::{Floats, take};
 use crate::multiply::{Right, product};
+use crate::op::InputGradients;
 use crate::winograd::pieces;
 
 /// Floats of a block's inputs and outputs: 128 KiB.
@@ -61,20 +62,19 @@ impl Layer for Conv1x1 {
     }
 
     /// Gradients from the output's gradient `dy` `[B, outputs, H, W]`.
-    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
+    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: [bool; 3]) -> InputGradients {
+        let [of_input, of_weight, of_bias] = wanted;
         let Self { inputs, outputs, .. } = *self;
-        let mut dx = wanted.input.then(|| take(x.len()));
+        let mut dx = of_input.then(|| take(x.len()));
         let mut blocks = self.blocks(dx.as_deref_mut().map(|dx| (dx, inputs)));
         let size = blocks.len().div_ceil(PARTS);
         let parts: Vec<_> =
             blocks.par_chunks_mut(size).map(|part| self.part(part, x, weight, dy, wanted)).collect();
-        Gradients {
-            input: dx,
-            weight: wanted
-                .weight
-                .then(|| join(parts.iter().map(|(weights, _)| &weights[..]), outputs * inputs)),
-            bias: wanted.bias.then(|| join(parts.iter().map(|(_, biases)| &biases[..]), outputs)),
-        }
+        [
+            dx,
+            of_weight.then(|| join(parts.iter().map(|(weights, _)| &weights[..]), outputs * inputs)),
+            of_bias.then(|| join(parts.iter().map(|(_, biases)| &biases[..]), outputs)),
+        ]
     }
 }
 
@@ -86,28 +86,28 @@ impl Conv1x1 {
         x: &[f32],
         weight: &[f32],
         dy: &[f32],
-        wanted: Wanted,
+        [of_input, of_weight, of_bias]: [bool; 3],
     ) -> (Vec<f32>, Vec<f32>) {
         let Self { inputs, outputs, pixels, rectified, .. } = *self;
-        let mut weights = vec![0.0; if wanted.weight { outputs * inputs } else { 0 }];
-        let mut biases = vec![0.0; if wanted.bias { outputs } else { 0 }];
+        let mut weights = vec![0.0; if of_weight { outputs * inputs } else { 0 }];
+        let mut biases = vec![0.0; if of_bias { outputs } else { 0 }];
         let mut add = false;
         for Block { image, first, count: n, out } in part {
             let (n, x) = (*n, &x[*image * inputs * pixels..][..inputs * pixels]);
             let dy = &dy[*image * outputs * pixels..][..outputs * pixels];
-            if wanted.weight {
+            if of_weight {
                 let mut read = Floats::new(if rectified { inputs * n } else { 0 });
                 let (x, [_, stride]) = self.read(&x[*first..], n, &mut read);
                 let (lhs, rhs) = ((&dy[*first..], [1, pixels]), Right::Plain((x, [stride, 1])));
                 product([outputs, inputs, n], lhs, &rhs, &mut weights, add);
                 add = true;
             }
-            if wanted.bias {
+            if of_bias {
                 for (bias, dy) in biases.iter_mut().zip(dy.chunks_exact(pixels)) {
                     *bias += total(&dy[*first..][..n]);
                 }
             }
-            if wanted.input {
+            if of_input {
                 let mut results = Floats::new(inputs * n);
                 let rhs = &Right::Plain((&dy[*first..], [1, pixels]));
                 product([inputs, n, outputs], (weight, [inputs, 1]), rhs, &mut results, false);

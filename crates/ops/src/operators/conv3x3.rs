@@ -13,8 +13,9 @@ use pulp::Arch;
 use rayon::prelude::*;
 
 use super::elements::channel_sums;
-use super::{Gradients, Layer, Unfolded, Wanted};
+use super::{Layer, Unfolded};
 use crate::buffers::{Floats, take};
+use crate::op::InputGradients;
 use crate::winograd::planes::{Planes, Scatter, Transposer};
 use crate::winograd::product::{Left, PANEL, Panels, Product};
 use crate::winograd::transforms::{self, Block, Inputs, Outputs, POINTS, TILE, lines};
@@ -54,24 +55,24 @@ impl Layer for Conv3x3 {
     }
 
     /// Gradients from the output's gradient `dy` `[B, outputs, H, W]`.
-    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
-        let input = wanted.input.then(|| {
+    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: [bool; 3]) -> InputGradients {
+        let [of_input, of_weight, of_bias] = wanted;
+        let input = of_input.then(|| {
             let back = Self { inputs: self.outputs, outputs: self.inputs, rectified: false, ..*self };
             let filters = back.transformed(weight, [9, 9 * self.inputs], true);
             back.run(dy, &filters, None, self.rectified.then_some(x))
         });
-        if wanted.weight && self.batch * self.height * self.width <= FEW_PIXELS {
+        if of_weight && self.batch * self.height * self.width <= FEW_PIXELS {
             let Self { batch, inputs, outputs, height, width, rectified } = *self;
             let direct = Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified };
-            let gradients = direct.backward(x, weight, (), dy, Wanted { input: false, ..wanted });
-            Gradients { input, ..gradients }
-        } else if wanted.weight {
+            let [_, weight, bias] = direct.backward(x, weight, (), dy, [false, true, of_bias]);
+            [input, weight, bias]
+        } else if of_weight {
             // The gradient of the bias is a by-product.
             let [weight, bias] = self.weight_gradient(x, dy);
-            Gradients { input, weight: Some(weight), bias: wanted.bias.then_some(bias) }
+            [input, Some(weight), of_bias.then_some(bias)]
         } else {
-            let bias = wanted.bias.then(|| channel_sums(dy, self.batch, self.outputs));
-            Gradients { input, weight: None, bias }
+            [input, None, of_bias.then(|| channel_sums(dy, self.batch, self.outputs))]
         }
     }
 }

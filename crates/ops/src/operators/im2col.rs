@@ -4,10 +4,11 @@
 
 use rayon::prelude::*;
 
+use super::Layer;
 use super::elements::{add_constant, channel_sums, mask, rectify};
-use super::{Gradients, Layer, Wanted};
 use crate::buffers::{Floats, take};
 use crate::multiply::{Right, product};
+use crate::op::InputGradients;
 use crate::winograd::pieces;
 
 /// Taps of a filter.
@@ -72,11 +73,12 @@ impl Layer for Unfolded {
     }
 
     /// Gradients from the output's gradient `dy` `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
-    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: Wanted) -> Gradients {
+    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: [bool; 3]) -> InputGradients {
+        let [of_input, of_weight, of_bias] = wanted;
         let Self { batch, inputs, outputs, .. } = *self;
         let [rows, columns] = self.size();
         let (plane, n) = (self.height * self.width, rows * columns);
-        let mut dx = wanted.input.then(|| take(x.len()));
+        let mut dx = of_input.then(|| take(x.len()));
         // Every task computes some input channels of all images.
         let slices: Vec<Vec<&mut [f32]>> = match &mut dx {
             Some(dx) => pieces(dx, inputs * plane, CHANNELS * plane),
@@ -86,12 +88,12 @@ impl Layer for Unfolded {
             let first = block * CHANNELS;
             let channels = CHANNELS.min(inputs - first);
             let width = channels * TAPS;
-            let mut sums = Floats::new(if wanted.weight { outputs * width } else { 0 });
+            let mut sums = Floats::new(if of_weight { outputs * width } else { 0 });
             let mut taps = Floats::new(width * n);
             for image in 0..batch {
                 let x = &x[(image * inputs + first) * plane..][..channels * plane];
                 let dy = &dy[image * outputs * n..][..outputs * n];
-                if wanted.weight {
+                if of_weight {
                     self.unfold(x, 0, &mut taps);
                     let rhs = &Right::Plain((&taps, [n, 1]));
                     product([outputs, width, n], (dy, [1, n]), rhs, &mut sums, image > 0);
@@ -109,7 +111,7 @@ impl Layer for Unfolded {
             sums
         };
         let sums: Vec<_> = slices.into_par_iter().enumerate().map(task).collect();
-        let weight = wanted.weight.then(|| {
+        let weight = of_weight.then(|| {
             let mut weight = take(outputs * inputs * TAPS);
             weight.par_chunks_exact_mut(inputs * TAPS).enumerate().for_each(|(output, out)| {
                 for (out, sums) in out.chunks_mut(CHANNELS * TAPS).zip(&sums) {
@@ -118,8 +120,8 @@ impl Layer for Unfolded {
             });
             weight
         });
-        let bias = wanted.bias.then(|| channel_sums(dy, batch, outputs));
-        Gradients { input: dx, weight, bias }
+        let bias = of_bias.then(|| channel_sums(dy, batch, outputs));
+        [dx, weight, bias]
     }
 }
 

@@ -4,10 +4,11 @@
 use rayon::prelude::*;
 
 use super::elements::{add_rows, add_to_rows};
-use super::{Gradients, Layer, Wanted, join, parts};
+use super::{Layer, join, parts};
 use crate::buffers::{Floats, take};
 use crate::math::{gelu, gelu_derivative};
 use crate::multiply::{Right, product};
+use crate::op::InputGradients;
 use crate::vectors::vectorized;
 
 /// Rows per task of the products over rows.
@@ -79,19 +80,19 @@ impl Layer for Linear {
         weight: &[f32],
         before: Option<Floats>,
         dy: &[f32],
-        wanted: Wanted,
-    ) -> Gradients {
+        [of_input, of_weight, of_bias]: [bool; 3],
+    ) -> InputGradients {
         assert_eq!(before.is_some(), self.gelu, "kept by the forward pass");
         let Self { rows, inputs, outputs, .. } = *self;
         let blocks = rows.div_ceil(ROWS);
-        let mut dx = wanted.input.then(|| take(rows * inputs));
+        let mut dx = of_input.then(|| take(rows * inputs));
         let mut dz = self.gelu.then(|| Floats::new(rows * outputs));
-        let mut sums = vec![0.0; if wanted.bias { blocks * outputs } else { 0 }];
+        let mut sums = vec![0.0; if of_bias { blocks * outputs } else { 0 }];
         let [column, row] = self.strides();
-        let transposed = wanted.input.then(|| Right::Plain((weight, [row, column])));
+        let transposed = of_input.then(|| Right::Plain((weight, [row, column])));
         let results = parts(dx.as_deref_mut(), ROWS * inputs, blocks).into_par_iter();
         let changed = parts(dz.as_deref_mut(), ROWS * outputs, blocks);
-        let totals = parts(wanted.bias.then_some(&mut sums), outputs, blocks);
+        let totals = parts(of_bias.then_some(&mut sums), outputs, blocks);
         results.zip(changed).zip(totals).enumerate().for_each(|(i, ((dx, dz), sums))| {
             let rows = i * ROWS * outputs..((i + 1) * ROWS).min(rows) * outputs;
             let dy = &dy[rows.clone()];
@@ -110,8 +111,8 @@ impl Layer for Linear {
                 product(size, (dz, [1, outputs]), rhs, dx, false);
             }
         });
-        let weight = wanted.weight.then(|| self.weight_gradient(x, dz.as_deref().unwrap_or(dy)));
-        Gradients { input: dx, weight, bias: wanted.bias.then(|| join(sums.chunks_exact(outputs), outputs)) }
+        let weight = of_weight.then(|| self.weight_gradient(x, dz.as_deref().unwrap_or(dy)));
+        [dx, weight, of_bias.then(|| join(sums.chunks_exact(outputs), outputs))]
     }
 }
 

@@ -22,6 +22,8 @@ use std::fmt::Debug;
 
 use rayon::prelude::*;
 
+use crate::op::InputGradients;
+
 pub use attention::{Attention, Tokens};
 pub use conv1x1::Conv1x1;
 pub use conv3x3::Conv3x3;
@@ -37,30 +39,16 @@ pub trait Layer: Debug + Send + Sync + 'static {
     /// `keep`: a backward pass will follow.
     fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept);
 
-    /// Gradients from the result's gradient `dy`.
-    fn backward(&self, x: &[f32], weight: &[f32], kept: Self::Kept, dy: &[f32], wanted: Wanted) -> Gradients;
-}
-
-/// Which gradients are wanted. Unwanted gradients cost nothing.
-#[derive(Debug, Clone, Copy)]
-pub struct Wanted {
-    /// Of the operator's input.
-    pub input: bool,
-    /// Of its weight.
-    pub weight: bool,
-    /// Of its bias.
-    pub bias: bool,
-}
-
-/// The wanted gradients, in the shapes of the input, the weight and the bias.
-#[derive(Debug)]
-pub struct Gradients {
-    /// Of the operator's input.
-    pub input: Option<Vec<f32>>,
-    /// Of its weight.
-    pub weight: Option<Vec<f32>>,
-    /// Of its bias.
-    pub bias: Option<Vec<f32>>,
+    /// The wanted gradients of the input, the weight and the bias, from the result's gradient `dy`. Unwanted gradients
+    /// cost nothing.
+    fn backward(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        kept: Self::Kept,
+        dy: &[f32],
+        wanted: [bool; 3],
+    ) -> InputGradients;
 }
 
 /// The sum of parts of `len` values each, in the order of the parts.

@@ -2,8 +2,9 @@
 
 use rayon::prelude::*;
 
-use super::{Gradients, Layer, Wanted, join, parts};
+use super::{Layer, join, parts};
 use crate::buffers::take;
+use crate::op::InputGradients;
 use crate::vectors::vectorized;
 
 /// Rows per task.
@@ -51,13 +52,13 @@ impl Layer for LayerNorm {
         weight: &[f32],
         statistics: Vec<Statistics>,
         dy: &[f32],
-        wanted: Wanted,
-    ) -> Gradients {
+        [of_input, of_weight, of_bias]: [bool; 3],
+    ) -> InputGradients {
         let (c, piece) = (self.channels, ROWS * self.channels);
         let blocks = statistics.len().div_ceil(ROWS);
-        let summed = wanted.weight || wanted.bias;
+        let summed = of_weight || of_bias;
         let mut sums = vec![0.0; if summed { 2 * blocks * c } else { 0 }];
-        let mut dx = wanted.input.then(|| take(x.len()));
+        let mut dx = of_input.then(|| take(x.len()));
         let results = parts(dx.as_deref_mut(), piece, blocks).into_par_iter();
         let totals = parts(summed.then_some(&mut sums), 2 * c, blocks);
         let given = x.par_chunks(piece).zip(dy.par_chunks(piece)).zip(statistics.par_chunks(ROWS));
@@ -70,9 +71,9 @@ impl Layer for LayerNorm {
             }
         });
         let mut joined = join(sums.chunks_exact(2 * c), 2 * c);
-        let bias = wanted.bias.then(|| joined.split_off(c));
+        let bias = of_bias.then(|| joined.split_off(c));
         joined.truncate(c);
-        Gradients { input: dx, weight: wanted.weight.then_some(joined), bias }
+        [dx, of_weight.then_some(joined), bias]
     }
 }
 

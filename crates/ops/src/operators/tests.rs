@@ -8,10 +8,7 @@ use crate::{Rope, bilinear, has_kernels, host, is_bf16, layers, linear_gelu, rot
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::nn::conv::{Conv2dConfig, ConvTranspose2dConfig};
 use burn::nn::{LayerNormConfig, LinearConfig, PaddingConfig2d};
-use burn::tensor::{Device, FloatDType, Gradients as Found, Tensor};
-
-/// All gradients.
-const ALL: Wanted = Wanted { input: true, weight: true, bias: true };
+use burn::tensor::{Device, FloatDType, Gradients, Tensor};
 
 /// Replaces all parameters by random values of a float type.
 struct Filled {
@@ -29,7 +26,7 @@ impl ModuleMapper for Filled {
 }
 
 /// Collects the gradients of all parameters.
-struct Collect<'a>(&'a Found, Vec<Vec<f64>>);
+struct Collect<'a>(&'a Gradients, Vec<Vec<f64>>);
 
 impl ModuleVisitor for Collect<'_> {
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
@@ -98,9 +95,9 @@ fn taps_that_see_nothing_have_no_gradient() {
     x[0] = 0.7;
     let mut dy = vec![0.0; 1024];
     dy[0] = 0.3;
-    let gradients = conv.backward(&x, &[0.1; 9], (), &dy, ALL);
+    let [_, weight, _] = conv.backward(&x, &[0.1; 9], (), &dy, [true; 3]);
     let expected: Vec<f32> = (0..9).map(|tap| if tap == 4 { 0.7 * 0.3 } else { 0.0 }).collect();
-    assert_eq!(gradients.weight, Some(expected));
+    assert_eq!(weight, Some(expected));
 }
 
 #[test]
@@ -228,9 +225,8 @@ fn everything(in_bf16: bool) -> Vec<Vec<f32>> {
     fn add<L: Layer>(all: &mut Vec<Vec<f32>>, layer: &L, [x, weight, bias, dy]: [&[f32]; 4]) {
         let (result, kept) = layer.forward(x, weight, Some(bias), true);
         assert_eq!(layer.forward(x, weight, Some(bias), false).0, result);
-        let Gradients { input, weight, bias } = layer.backward(x, weight, kept, dy, ALL);
         all.push(result);
-        all.extend([input, weight, bias].into_iter().flatten());
+        all.extend(layer.backward(x, weight, kept, dy, [true; 3]).into_iter().flatten());
     }
     let mut all = Vec::new();
     let (x, dy) = (random(2 * 40 * 30 * 50, 1), random(2 * 72 * 30 * 50, 2));
@@ -270,14 +266,14 @@ fn the_number_of_threads_changes_no_bit() {
 fn only_wanted_gradients_are_found_and_they_are_the_same() {
     let conv = Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false };
     let (x, weight, dy) = (random(3 * 42, 1), random(135, 2), random(5 * 42, 3));
-    let all = conv.backward(&x, &weight, (), &dy, ALL);
+    let all = conv.backward(&x, &weight, (), &dy, [true; 3]);
     for bits in 0..8 {
-        let wanted = Wanted { input: bits & 1 > 0, weight: bits & 2 > 0, bias: bits & 4 > 0 };
+        let wanted = [1, 2, 4].map(|bit| bits & bit > 0);
         let got = conv.backward(&x, &weight, (), &dy, wanted);
-        assert_eq!(got.input, all.input.clone().filter(|_| wanted.input));
-        assert_eq!(got.weight, all.weight.clone().filter(|_| wanted.weight));
-        assert_eq!(got.bias.is_some(), wanted.bias);
-        let bias = got.bias.unwrap_or_else(|| all.bias.clone().expect("all are wanted"));
-        assert_equal("bias", &wide(&bias), &wide(all.bias.as_ref().expect("all are wanted")));
+        assert_eq!(got[0], all[0].clone().filter(|_| wanted[0]));
+        assert_eq!(got[1], all[1].clone().filter(|_| wanted[1]));
+        assert_eq!(got[2].is_some(), wanted[2]);
+        let all = all[2].as_ref().expect("all are wanted");
+        assert_equal("bias", &wide(got[2].as_ref().unwrap_or(all)), &wide(all));
     }
 }

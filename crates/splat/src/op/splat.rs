@@ -6,7 +6,7 @@
 use cubecl::CubeTypeMut;
 use cubecl::prelude::*;
 
-use super::twofold::{exp, to_f32, to_u32};
+use super::twofold::exp;
 use crate::linear::{Quat, Vec3, load3};
 use crate::options::{MIN_ALPHA, TILE};
 use crate::projection::{Footprint, View, footprint, project, span, to_camera};
@@ -216,9 +216,9 @@ pub fn splat(
 #[cube]
 fn pixels_between(low: f32, high: f32, side: u32) -> Extent {
     let first = (low - 0.5).max(0.0).ceil();
-    let last = (high - 0.5).min(to_f32(side) - 1.0).floor();
+    let last = (high - 0.5).min(side as f32 - 1.0).floor();
     let any = first <= last;
-    Extent { first: select(any, to_u32(first), 0u32), end: select(any, to_u32(last) + 1u32, 0u32) }
+    Extent { first: select(any, first as u32, 0u32), end: select(any, last as u32 + 1u32, 0u32) }
 }
 
 /// The tiles that contain the pixels.
@@ -233,8 +233,8 @@ pub fn tiles_of(pixels: &Extent) -> Extent {
 #[cube]
 pub fn tiles_in_row(splat: &Splat, y: u32, uniforms: &Uniforms) -> Extent {
     let tile = comptime!(TILE as u32);
-    let top = to_f32(y * tile) + 0.5 - splat.v;
-    let bottom = to_f32((y * tile + tile - 1u32).min(uniforms.height - 1u32)) + 0.5 - splat.v;
+    let top = (y * tile) as f32 + 0.5 - splat.v;
+    let bottom = (y * tile + tile - 1u32).min(uniforms.height - 1u32) as f32 + 0.5 - splat.v;
     let reached = span(splat.l0, splat.k, splat.l1, splat.radius_squared, top, bottom);
     tiles_of(&pixels_between(splat.u + reached.left, splat.u + reached.right, uniforms.width))
 }

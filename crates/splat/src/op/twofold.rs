@@ -1,5 +1,5 @@
-//! Functions that Rust and CubeCL spell differently: `f` runs on CPUs, and CubeCL calls `f::expand` where a `#[cube]`
-//! function that calls `f` is compiled for a GPU.
+//! A function that Rust and CubeCL spell differently: `exp` runs on CPUs, and CubeCL calls `exp::expand` where a
+//! `#[cube]` function that calls `exp` is compiled for a GPU.
 
 /// exp(x) for x ≤ 0, within 2 units in the last place; exp(−87) for x below −87. GPUs use their own exp.
 ///
@@ -28,39 +28,11 @@ pub fn exp(x: f32) -> f32 {
     p * f32::from_bits(exponent)
 }
 
-/// The integer part of a number that is not negative.
-#[inline(always)]
-pub fn to_u32(x: f32) -> u32 {
-    x as u32
-}
-
-/// A small integer as a float.
-#[inline(always)]
-pub fn to_f32(n: u32) -> f32 {
-    n as f32
-}
-
 pub mod exp {
     use cubecl::prelude::*;
 
     pub fn expand(scope: &Scope, x: NativeExpand<f32>) -> NativeExpand<f32> {
         x.__expand_exp_method(scope)
-    }
-}
-
-pub mod to_u32 {
-    use cubecl::prelude::*;
-
-    pub fn expand(scope: &Scope, x: NativeExpand<f32>) -> NativeExpand<u32> {
-        u32::__expand_cast_from::<f32>(scope, x)
-    }
-}
-
-pub mod to_f32 {
-    use cubecl::prelude::*;
-
-    pub fn expand(scope: &Scope, n: NativeExpand<u32>) -> NativeExpand<f32> {
-        f32::__expand_cast_from::<u32>(scope, n)
     }
 }
 

@@ -127,7 +127,25 @@ impl SplatKernels for CubeBackend {
         let gradients = inputs.as_ref().with(wanted, |input, wanted| wanted.then(|| like(input, &buffers)));
         let record = Record::new(wanted, job);
         if record.len() > 0 && scene.len > 0 {
-            let records = records(&buffers, &scene, job, state, upstream, record);
+            // One record of sums per intersection.
+            let records = buffers.f32(state.lists.len * record.len());
+            let all_tiles = job.tiles_x() * job.tiles_y() * job.views.len();
+            backward::pixels::launch(
+                &buffers.client,
+                buffers.cubes(all_tiles),
+                CubeDim::new_1d(blend::UNITS as u32),
+                state.splats.clone().into_buffer_arg(),
+                scene.inputs.colors.clone().into_buffer_arg(),
+                state.lists.launch(),
+                state.lists.slots.clone().into_buffer_arg(),
+                state.transmittance.clone().into_buffer_arg(),
+                state.last.clone().into_buffer_arg(),
+                upstream.into_buffer_arg(),
+                records.clone().into_buffer_arg(),
+                scene.uniforms(job),
+                job.options.depth,
+                record,
+            );
             let unused = |tensor: &Option<CubeTensor>| {
                 tensor.clone().unwrap_or_else(|| buffers.f32(1)).into_buffer_arg()
             };
@@ -303,34 +321,4 @@ fn lists(
         len,
     );
     Ok((splats, reach, Lists { entries, slots, starts, ends, len }, counts))
-}
-
-/// The records of all intersections.
-fn records(
-    buffers: &Buffers,
-    scene: &Scene,
-    job: &Job,
-    state: &State,
-    upstream: CubeTensor,
-    record: Record,
-) -> CubeTensor {
-    let records = buffers.f32(state.lists.len * record.len());
-    let all_tiles = job.tiles_x() * job.tiles_y() * job.views.len();
-    backward::pixels::launch(
-        &buffers.client,
-        buffers.cubes(all_tiles),
-        CubeDim::new_1d(blend::UNITS as u32),
-        state.splats.clone().into_buffer_arg(),
-        scene.inputs.colors.clone().into_buffer_arg(),
-        state.lists.launch(),
-        state.lists.slots.clone().into_buffer_arg(),
-        state.transmittance.clone().into_buffer_arg(),
-        state.last.clone().into_buffer_arg(),
-        upstream.into_buffer_arg(),
-        records.clone().into_buffer_arg(),
-        scene.uniforms(job),
-        job.options.depth,
-        record,
-    );
-    records
 }
