@@ -251,8 +251,9 @@ fn tables_name_photographs_beside_them() {
     let photographs: PathBuf = temporary.path().join("a");
     fs::create_dir(&photographs).expect("made");
     pair(&photographs, "x_front.png", "x_back.png");
+    // As a spreadsheet may write it.
     let table = temporary.path().join("list.csv");
-    fs::write(&table, "\u{feff}back, front\na/x_back.png, a/x_front.png\n").expect("written");
+    fs::write(&table, "\u{feff}Back; Front\r\na/x_back.png; a/x_front.png\r\n;\r\n").expect("written");
     let out = temporary.path().join("out");
     succeed(&mut reconstruct(&table, &out));
     assert_eq!(names(&out), ["pairs.config.toml", "x.ply"]);

@@ -193,8 +193,12 @@ fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
     let cannot = |e: csv::Error| Failure::file(path, e);
     let folder = path.parent().unwrap_or(Path::new(""));
     let text = file::read_text(path, LARGEST_TABLE).map_err(FileError::read(path))?;
-    let mut table = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(text.as_bytes());
-    let columns = table.headers().map_err(cannot)?.clone();
+    // Spreadsheets of many countries separate by semicolons.
+    let names = text.lines().next().unwrap_or_default();
+    let delimiter = *b";\t".iter().find(|byte| names.as_bytes().contains(byte)).unwrap_or(&b',');
+    let mut table = csv::ReaderBuilder::new();
+    let mut table = table.trim(csv::Trim::All).delimiter(delimiter).from_reader(text.as_bytes());
+    let columns: csv::StringRecord = table.headers().map_err(cannot)?.iter().map(str::to_lowercase).collect();
     if let Some(missing) =
         ["front", "back"].iter().find(|name| !columns.iter().any(|column| column == **name))
     {
@@ -203,6 +207,9 @@ fn in_list(path: &Path) -> Result<Vec<Job>, Failure> {
     let mut jobs = Vec::new();
     for record in table.records() {
         let record = record.map_err(cannot)?;
+        if record.iter().all(str::is_empty) {
+            continue;
+        }
         let wrong = |message: &str| {
             // The reader's own numbers count CRLF twice, and a record may begin with the end of the line before.
             let start = record.position().map_or(0, |position| position.byte() as usize);

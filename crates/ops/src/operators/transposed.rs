@@ -74,7 +74,15 @@ impl WithSimd for OutputGradients<'_> {
                 }
             }
             let planes = out.chunks_exact_mut(stride * GROUP).skip(group).step_by(groups);
-            spread(simd, lines, block.columns, tile_row, planes, |d| gradient_points::<S>(simd, d));
+            spread(
+                simd,
+                lines,
+                block.columns,
+                tile_row,
+                planes,
+                #[inline(always)]
+                |d| gradient_points::<S>(simd, d),
+            );
         }
     }
 }

@@ -163,7 +163,15 @@ impl WithSimd for Inputs<'_> {
                 source.read(group, row, first, out);
             }
             let planes = out.chunks_exact_mut(stride * GROUP).skip(group).step_by(groups);
-            spread(simd, lines, block.columns, tile_row, planes, |d| input_points::<S>(simd, d));
+            spread(
+                simd,
+                lines,
+                block.columns,
+                tile_row,
+                planes,
+                #[inline(always)]
+                |d| input_points::<S>(simd, d),
+            );
         }
     }
 }
