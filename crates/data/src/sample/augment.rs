@@ -9,6 +9,7 @@ use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use snapsnap_base::config::outside;
+use snapsnap_photo::Rect;
 
 /// Largest change of red and blue against green, as a share.
 const WHITE_BALANCE: f32 = 0.06;
@@ -122,30 +123,16 @@ pub(super) fn moved(mask: &GrayImage, reach: f32) -> GrayImage {
         let value = if inside { mask.as_raw()[(y * width + x) as usize] } else { 0 };
         if dilate { value } else { 255 - value }
     };
-    // Squares of pixels with anything in them. A disc reaches at most into the squares beside its own.
-    let square = whole.max(8);
-    let squares = [width, height].map(|side| side.div_euclid(square) + 1);
-    let mut filled = vec![false; (squares[0] * squares[1]) as usize];
-    for y in 0..height {
-        for x in 0..width {
-            filled[(y / square * squares[0] + x / square) as usize] |= at(x, y) > 0;
-        }
-    }
-    let near = |x: i64, y: i64| {
-        let (x, y) = (x / square, y / square);
-        (y - 1..=y + 1).any(|y| {
-            (x - 1..=x + 1).any(|x| {
-                // A mask is empty outside the picture. Erosion makes the empty part grow.
-                let inside = (0..squares[0]).contains(&x) && (0..squares[1]).contains(&y);
-                if inside { filled[(y * squares[0] + x) as usize] } else { !dilate }
-            })
-        })
-    };
+    // The mask's box and what a disc reaches around it. The rest stays empty.
+    let [columns, rows] = Rect::around(mask, 1).map_or([0..0, 0..0], |person| {
+        [(person.x, person.width), (person.y, person.height)]
+            .map(|(first, size)| i64::from(first) - whole..i64::from(first + size) + whole)
+    });
     GrayImage::from_fn(mask.width(), mask.height(), |x, y| {
         let (x, y) = (i64::from(x), i64::from(y));
         let here = at(x, y);
-        // Most pixels are far from the outline. A full pixel cannot grow.
-        let value = if here == 255 || !near(x, y) {
+        // A full pixel cannot grow.
+        let value = if here == 255 || !columns.contains(&x) || !rows.contains(&y) {
             here
         } else {
             disc.iter().map(|(dx, dy, share)| f32::from(at(x + dx, y + dy)) * share).fold(0.0, f32::max) as u8

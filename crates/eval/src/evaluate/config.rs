@@ -162,6 +162,8 @@ pub enum Protocol {
     Paper,
     /// The person and a margin of 8 of 1024 pixels.
     Masked,
+    /// The upper part of [`Self::Masked`]: head and neck.
+    Head,
 }
 
 impl Protocol {
@@ -170,6 +172,7 @@ impl Protocol {
         match self {
             Self::Paper => "paper",
             Self::Masked => "masked",
+            Self::Head => "head",
         }
     }
 }

@@ -276,6 +276,7 @@ impl Place<'_> {
         let region = |protocol: &Protocol| match protocol {
             Protocol::Paper => Region::paper(&target),
             Protocol::Masked => masked(),
+            Protocol::Head => Ok(masked()?.head()),
         };
         let regions = config.metrics.protocols.iter().map(region).collect::<Result<Vec<_>, _>>()?;
         let scores = |(i, shown): (usize, &Option<Shown>)| {

@@ -1,6 +1,6 @@
 //! Alignment of reconstructions that are not in the world frame, by iterative closest point (Besl & McKay 1992).
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DMat4, DQuat, DVec3, DVec4};
 use serde::{Deserialize, Serialize};
 use snapsnap_splat::RigidTransform;
 
@@ -122,13 +122,13 @@ pub(crate) fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool)
     }
     let m = covariance.to_cols_array_2d();
     let s = |row: usize, column: usize| m[column][row];
-    let matrix = [
+    let matrix = DMat4::from_cols_array_2d(&[
         [s(0, 0) + s(1, 1) + s(2, 2), s(1, 2) - s(2, 1), s(2, 0) - s(0, 2), s(0, 1) - s(1, 0)],
         [s(1, 2) - s(2, 1), s(0, 0) - s(1, 1) - s(2, 2), s(0, 1) + s(1, 0), s(2, 0) + s(0, 2)],
         [s(2, 0) - s(0, 2), s(0, 1) + s(1, 0), s(1, 1) - s(0, 0) - s(2, 2), s(1, 2) + s(2, 1)],
         [s(0, 1) - s(1, 0), s(2, 0) + s(0, 2), s(1, 2) + s(2, 1), s(2, 2) - s(0, 0) - s(1, 1)],
-    ];
-    let [w, x, y, z] = largest_eigenvector(matrix);
+    ]);
+    let [w, x, y, z] = largest_eigenvector(matrix).to_array();
     let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
     for (p, t) in points.iter().zip(targets) {
         rotated += (rotation * (double(*p) - from)).dot(double(*t) - to);
@@ -139,29 +139,17 @@ pub(crate) fn procrustes(points: &[[f32; 3]], targets: &[[f32; 3]], scale: bool)
     Alignment { scale, rotation, translation, cost: 0.0 }
 }
 
-/// The eigenvector of the largest eigenvalue of a symmetric matrix, by Jacobi rotations.
-fn largest_eigenvector(mut a: [[f64; 4]; 4]) -> [f64; 4] {
-    const SWEEPS: usize = 30;
-    let mut vectors = [[0.0; 4]; 4];
-    (0..4).for_each(|i| vectors[i][i] = 1.0);
-    for _ in 0..SWEEPS {
-        for (p, q) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
-            if a[p][q] == 0.0 {
-                continue;
-            }
-            let theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
-            let t = theta.signum() / (theta.abs() + theta.hypot(1.0));
-            let c = 1.0 / t.hypot(1.0);
-            let s = t * c;
-            for row in a.iter_mut().chain(&mut vectors) {
-                (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
-            }
-            let (rows, others) = a.split_at_mut(q);
-            for (x, y) in rows[p].iter_mut().zip(&mut others[0]) {
-                (*x, *y) = (c * *x - s * *y, s * *x + c * *y);
-            }
-        }
+/// The eigenvector of the largest eigenvalue of a symmetric matrix: a column of a high power.
+fn largest_eigenvector(matrix: DMat4) -> DVec4 {
+    /// Squarings: eigenvalues that differ in the last digit are told apart.
+    const SQUARINGS: usize = 60;
+    let size = |m: DMat4| m.to_cols_array().map(f64::abs).iter().sum::<f64>();
+    // No eigenvalue is negative after the shift. If all points are equal, the matrix is 0.
+    let mut power = matrix + (size(matrix) + f64::MIN_POSITIVE) * DMat4::IDENTITY;
+    for _ in 0..SQUARINGS {
+        power *= 1.0 / size(power);
+        power *= power;
     }
-    let largest = (0..4).max_by(|i, j| a[*i][*i].total_cmp(&a[*j][*j])).expect("four");
-    vectors.map(|row| row[largest])
+    let columns = (0..4).map(|i| power.col(i));
+    columns.max_by(|a, b| a.length_squared().total_cmp(&b.length_squared())).expect("four")
 }

@@ -1,10 +1,10 @@
 //! Photographs on their canvas → the input of the point predictor.
 
-use burn::tensor::{Device, Tensor, TensorData};
-use snapsnap_splat::Camera;
+use burn::tensor::Tensor;
 
 use super::View;
-use crate::config::Config;
+use super::rays::Rays;
+use crate::config::{Config, OPPOSITE};
 use crate::resample::shrink;
 use crate::window::Window;
 
@@ -33,9 +33,13 @@ impl Input {
         }
         let [count, _, height, width] = parts[0].dims();
         if n.ray_channels {
-            let device = parts[0].device();
-            let of = |view| rays(config, view, window, &device).expand([count / 2, 2, height, width]);
-            parts.push(Tensor::cat(vec![of(View::Front), of(View::Back)], 0));
+            // x/z and y/z in the nominal camera's frame, with the sign of x/z changed for the back.
+            let (factor, device) = (config.upsample_factor(), parts[0].device());
+            let (side, window) = (n.resolution / factor, window.shrunk(factor));
+            let rays = Rays::new(View::Front, OPPOSITE, side, &window, &device).directions;
+            let rays = rays.narrow(3, 0, 2).permute([0, 3, 1, 2]).expand([count / 2, 2, height, width]);
+            let back = Tensor::cat(vec![-rays.clone().narrow(1, 0, 1), rays.clone().narrow(1, 1, 1)], 1);
+            parts.push(Tensor::cat(vec![rays, back], 0));
         }
         let images = if parts.len() > 1 { Tensor::cat(parts, 1) } else { parts.remove(0) };
         let seen = |x: Tensor<4>| if n.mirror { mirrored_backs(x) } else { x };
@@ -54,21 +58,4 @@ fn both_ways(x: Tensor<4>) -> Tensor<4> {
 fn mirrored_backs(x: Tensor<4>) -> Tensor<4> {
     let half = x.dims()[0] / 2;
     Tensor::cat(vec![x.clone().narrow(0, 0, half), x.narrow(0, half, half).flip([3])], 0)
-}
-
-/// Ray directions of a photograph's network pixels `[1, 2, h, w]`: x/z and y/z in the nominal camera's frame, with
-/// the sign of x/z changed for the back.
-fn rays(config: &Config, view: View, window: &Window, device: &Device) -> Tensor<4> {
-    let camera = Camera::orbit_at_yaw_degrees(0.0, config.network.resolution as u32);
-    let factor = config.upsample_factor();
-    let (height, width) = (window.rows.len() / factor, window.columns.len() / factor);
-    let middle = |start: usize, i: usize| start as f64 + (i as f64 + 0.5) * factor as f64;
-    let sign = if view == View::Back { -1.0 } else { 1.0 };
-    let x =
-        |column| sign * (middle(window.columns.start, column) - camera.principal_point.x) / camera.focal.x;
-    let y = |row| (middle(window.rows.start, row) - camera.principal_point.y) / camera.focal.y;
-    let across = (0..height).flat_map(|_| (0..width).map(x));
-    let down = (0..height).flat_map(|row| (0..width).map(move |_| y(row)));
-    let values: Vec<f32> = across.chain(down).map(|v| v as f32).collect();
-    Tensor::from_data(TensorData::new(values, [1, 2, height, width]), device)
 }

@@ -34,30 +34,10 @@ pub struct Attention {
 /// Rotation tables cos and ±sin, `[tokens, head_dim]` each, as [`crate::Rope`] holds them.
 pub type Tables<'a> = [&'a [f32]; 2];
 
-/// Queries, keys or values `[B, tokens, C]`, which may be some of the channels of wider tokens.
-#[derive(Debug, Clone, Copy)]
-pub struct Tokens<'a> {
-    values: &'a [f32],
-    /// Floats from one token to the next.
-    width: usize,
-}
-
-impl<'a> Tokens<'a> {
-    /// Queries, keys and values of a self-attention from one tensor `[B, tokens, 3·C]`.
-    pub fn parts(qkv: &'a [f32], channels: usize) -> [Self; 3] {
-        [0, 1, 2].map(|part| Self { values: &qkv[part * channels..], width: 3 * channels })
-    }
-
-    /// Queries, keys and values from three tensors.
-    pub fn apart(qkv: [&'a [f32]; 3], channels: usize) -> [Self; 3] {
-        qkv.map(|values| Self { values, width: channels })
-    }
-}
-
 impl Attention {
     /// softmax(rotated q · rotated kᵀ / √head_dim) · v of queries, keys and values `[B, tokens, C]` → `[B, tokens, C]`,
     /// and the logarithms of the rows' sums of exponentials, `[B, heads, tokens]`.
-    pub fn forward(&self, [q, k, v]: [Tokens; 3], rope: Tables) -> (Vec<f32>, Vec<f32>) {
+    pub fn forward(&self, [q, k, v]: [&[f32]; 3], rope: Tables) -> (Vec<f32>, Vec<f32>) {
         let Self { tokens, head_dim: d, .. } = *self;
         let mut by_head = Floats::new(self.batch * tokens * self.heads * d);
         let mut logarithms = vec![0.0; self.batch * self.heads * tokens];
@@ -66,7 +46,7 @@ impl Attention {
             let [packed_q, packed_k] =
                 [(q, self.scale()), (k, 1.0)].map(|(x, factor)| self.pack(x, i, rope, factor));
             let across = self.right([d, tokens], (&packed_k, [d, 1]));
-            let values = self.right([tokens, d], (self.head(v, i), [1, v.width]));
+            let values = self.right([tokens, d], (self.head(v, i), [1, self.heads * d]));
             let mut scores = Floats::new(FORWARD_BLOCK.min(tokens) * tokens);
             let blocks = packed_q.chunks(FORWARD_BLOCK * d).zip(out.chunks_mut(FORWARD_BLOCK * d));
             for ((block, out), logarithms) in blocks.zip(logarithms.chunks_mut(FORWARD_BLOCK)) {
@@ -80,23 +60,18 @@ impl Attention {
                 }
             }
         });
-        (self.by_token([&by_head]), logarithms)
+        (self.by_token(&by_head), logarithms)
     }
 
     /// Gradients of queries, keys and values from the output's gradient `dy` `[B, tokens, C]`. One function computes
     /// all three, because they share nearly all of the work.
-    pub fn backward(&self, qkv: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> [Vec<f32>; 3] {
-        self.by_head(qkv, rope, logarithms, dy).map(|values| self.by_token([&values]))
-    }
-
-    /// [`Attention::backward`] with the three gradients in one tensor `[B, tokens, 3·C]`.
-    pub fn backward_parts(&self, qkv: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> Vec<f32> {
-        let by_head = self.by_head(qkv, rope, logarithms, dy);
-        self.by_token(by_head.each_ref().map(|values| &values[..]))
-    }
-
-    /// Gradients of queries, keys and values, `[B, heads, tokens, head_dim]`.
-    fn by_head(&self, [q, k, v]: [Tokens; 3], rope: Tables, logarithms: &[f32], dy: &[f32]) -> [Floats; 3] {
+    pub fn backward(
+        &self,
+        [q, k, v]: [&[f32]; 3],
+        rope: Tables,
+        logarithms: &[f32],
+        dy: &[f32],
+    ) -> [Vec<f32>; 3] {
         let Self { tokens, head_dim: d, .. } = *self;
         let width = self.heads * d;
         let mut by_head = [(); 3].map(|()| Floats::new(self.batch * tokens * width));
@@ -106,9 +81,8 @@ impl Attention {
         heads.for_each(|(i, ((dq, dk), dv))| {
             let [packed_q, packed_k] =
                 [(q, self.scale()), (k, 1.0)].map(|(x, factor)| self.pack(x, i, rope, factor));
-            let (values, dy) = (self.head(v, i), self.head(Tokens { values: dy, width }, i));
-            let across =
-                [(&packed_k[..], [d, 1]), (values, [v.width, 1])].map(|x| self.right([d, tokens], x));
+            let (values, dy) = (self.head(v, i), self.head(dy, i));
+            let across = [(&packed_k[..], [d, 1]), (values, [width, 1])].map(|x| self.right([d, tokens], x));
             let along = self.right([tokens, d], (&packed_k, [1, d]));
             let [mut scores, mut gradients] = [(); 2].map(|()| Floats::new(BLOCK.min(tokens) * tokens));
             let blocks = packed_q.chunks(BLOCK * d).zip(dq.chunks_mut(BLOCK * d));
@@ -125,10 +99,10 @@ impl Attention {
                 product([tokens, d, rows], (gradients, [tokens, 1]), &of_block[0], dk, add);
                 product([tokens, d, rows], (scores, [tokens, 1]), &of_block[1], dv, add);
             }
-            unrotate(dq, d, rope, self.scale());
-            unrotate(dk, d, rope, 1.0);
+            rotate(dq, d, rope, self.scale(), -1.0);
+            rotate(dk, d, rope, 1.0, -1.0);
         });
-        by_head
+        by_head.map(|values| self.by_token(&values))
     }
 
     fn right<'a>(&self, size: [usize; 2], matrix: Matrix<'a>) -> Right<'a> {
@@ -140,31 +114,32 @@ impl Attention {
     }
 
     /// The values from the first token of a head on; `i` counts the heads of all samples.
-    fn head<'a>(&self, x: Tokens<'a>, i: usize) -> &'a [f32] {
-        &x.values[i / self.heads * self.tokens * x.width + i % self.heads * self.head_dim..]
+    fn head<'a>(&self, x: &'a [f32], i: usize) -> &'a [f32] {
+        &x[(i / self.heads * self.tokens * self.heads + i % self.heads) * self.head_dim..]
     }
 
     /// The tokens `[tokens, head_dim]` of head `i`, rotated and multiplied by `factor`.
-    fn pack(&self, x: Tokens, i: usize, rope: Tables, factor: f32) -> Floats {
-        let mut out = Floats::new(self.tokens * self.head_dim);
-        rotate(self.head(x, i), x.width, self.head_dim, rope, factor, &mut out);
+    fn pack(&self, x: &[f32], i: usize, rope: Tables, factor: f32) -> Floats {
+        let d = self.head_dim;
+        let mut out = Floats::new(self.tokens * d);
+        for (out, x) in out.chunks_exact_mut(d).zip(self.head(x, i).chunks(self.heads * d)) {
+            out.copy_from_slice(&x[..d]);
+        }
+        rotate(&mut out, d, rope, factor, 1.0);
         out
     }
 
-    /// Parts `[B, heads, tokens, head_dim]` → `[B, tokens, parts·C]`.
-    fn by_token<const PARTS: usize>(&self, parts: [&[f32]; PARTS]) -> Vec<f32> {
+    /// `[B, heads, tokens, head_dim]` → `[B, tokens, C]`.
+    fn by_token(&self, by_head: &[f32]) -> Vec<f32> {
         /// Tokens per task.
         const TOKENS: usize = 64;
-        let Self { tokens, head_dim: d, .. } = *self;
-        let width = self.heads * d;
-        let mut out = take(PARTS * self.batch * tokens * width);
-        out.par_chunks_mut(TOKENS * PARTS * width).enumerate().for_each(|(i, out)| {
-            for (j, out) in out.chunks_exact_mut(PARTS * width).enumerate() {
+        let Self { tokens, heads, head_dim: d, .. } = *self;
+        let mut out = take(by_head.len());
+        out.par_chunks_mut(TOKENS * heads * d).enumerate().for_each(|(i, out)| {
+            for (j, out) in out.chunks_exact_mut(heads * d).enumerate() {
                 let (b, n) = ((i * TOKENS + j) / tokens, (i * TOKENS + j) % tokens);
-                for (part, out) in parts.iter().zip(out.chunks_exact_mut(width)) {
-                    for (h, out) in out.chunks_exact_mut(d).enumerate() {
-                        out.copy_from_slice(&part[((b * self.heads + h) * tokens + n) * d..][..d]);
-                    }
+                for (h, out) in out.chunks_exact_mut(d).enumerate() {
+                    out.copy_from_slice(&by_head[((b * heads + h) * tokens + n) * d..][..d]);
                 }
             }
         });
@@ -172,46 +147,23 @@ impl Attention {
     }
 }
 
-/// Rotates, scales and packs one head's tokens, which begin `width` floats apart.
-fn rotate(x: &[f32], width: usize, d: usize, rope: Tables, factor: f32, out: &mut [f32]) {
-    let quarter = d / 4;
-    vectorized(
-        #[inline(always)]
-        move || {
-            for (token, out) in out.chunks_exact_mut(d).enumerate() {
-                let x = &x[token * width..][..d];
-                let (cos, sin) = (&rope[0][token * d..][..d], &rope[1][token * d..][..d]);
-                // Two halves (row, column). The two quarters of a half hold the members of its pairs.
-                for half in [0, 2 * quarter] {
-                    let [x, cos, sin] =
-                        [x, cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
-                    let (first, second) = out[half..half + 2 * quarter].split_at_mut(quarter);
-                    for k in 0..quarter {
-                        first[k] = (x.0[k] * cos.0[k] + x.1[k] * sin.0[k]) * factor;
-                        second[k] = (x.1[k] * cos.1[k] + x.0[k] * sin.1[k]) * factor;
-                    }
-                }
-            }
-        },
-    );
-}
-
-/// Rotates the gradients of rotated tokens back, in place, and scales them.
-fn unrotate(x: &mut [f32], d: usize, rope: Tables, factor: f32) {
+/// Rotates one head's tokens in place, and scales them. `sign`: 1, or −1 to rotate back.
+fn rotate(x: &mut [f32], d: usize, rope: Tables, factor: f32, sign: f32) {
     let quarter = d / 4;
     vectorized(
         #[inline(always)]
         move || {
             let tables = rope[0].chunks_exact(d).zip(rope[1].chunks_exact(d));
             for (x, (cos, sin)) in x.chunks_exact_mut(d).zip(tables) {
+                // Two halves (row, column). The two quarters of a half hold the members of its pairs.
                 for half in [0, 2 * quarter] {
                     let [cos, sin] =
                         [cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
                     let (first, second) = x[half..half + 2 * quarter].split_at_mut(quarter);
                     for k in 0..quarter {
-                        let (a, b) = (first[k] * factor, second[k] * factor);
-                        first[k] = a * cos.0[k] + b * sin.1[k];
-                        second[k] = b * cos.1[k] + a * sin.0[k];
+                        let (a, b) = (first[k], second[k]);
+                        first[k] = (a * cos.0[k] + b * (sign * sin.0[k])) * factor;
+                        second[k] = (b * cos.1[k] + a * (sign * sin.1[k])) * factor;
                     }
                 }
             }

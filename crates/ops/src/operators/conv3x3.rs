@@ -16,7 +16,7 @@ use super::elements::channel_sums;
 use super::{Layer, Unfolded};
 use crate::buffers::{Floats, take};
 use crate::op::InputGradients;
-use crate::winograd::planes::{Planes, Scatter, Transposer};
+use crate::winograd::planes::{Planes, Scatter};
 use crate::winograd::product::{Left, PANEL, Panels, Product};
 use crate::winograd::transforms::{self, Block, Inputs, Outputs, POINTS, TILE, lines};
 use crate::winograd::{GROUP, pieces};
@@ -99,7 +99,7 @@ impl Conv3x3 {
         let mut padded = bias.unwrap_or_default().to_vec();
         padded.resize(self.outputs.next_multiple_of(GROUP), 0.0);
         let mut out = take(self.batch * self.outputs * plane);
-        let (band, transposer) = (self.band_rows(), Transposer::new());
+        let band = self.band_rows();
         let tasks: Vec<_> = out
             .chunks_exact_mut(self.outputs * plane)
             .zip(x.chunks_exact(self.inputs * plane))
@@ -110,7 +110,7 @@ impl Conv3x3 {
             })
             .collect();
         tasks.into_par_iter().for_each(|(image, data, row, mut out)| {
-            let planes = Planes { data, height, width, rectified, transposer };
+            let planes = Planes { data, height, width, rectified };
             let pixels = out[0].len();
             let mut grouped = Floats::new(padded.len() * pixels);
             let mut slices: Vec<_> = grouped.chunks_exact_mut(pixels * GROUP).collect();
@@ -119,7 +119,7 @@ impl Conv3x3 {
                 let first = (image * self.outputs + group * GROUP) * plane + row * TILE * width;
                 let mask = mask.map(|mask| (&mask[first..], plane));
                 let pixels = &grouped[group * pixels * GROUP..][..pixels * GROUP];
-                Scatter { pixels, planes, mask }.run(transposer);
+                Arch::new().dispatch(Scatter { pixels, planes, mask });
             }
         });
         out

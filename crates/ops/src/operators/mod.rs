@@ -24,7 +24,7 @@ use rayon::prelude::*;
 
 use crate::op::InputGradients;
 
-pub use attention::{Attention, Tokens};
+pub use attention::Attention;
 pub use conv1x1::Conv1x1;
 pub use conv3x3::Conv3x3;
 pub use im2col::Unfolded;

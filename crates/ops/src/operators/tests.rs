@@ -4,7 +4,7 @@
 use super::*;
 use crate::rotary::plain_attention;
 use crate::testing::{assert_equal, relative_error, tensor, uniform as random, values, wide};
-use crate::{Rope, bilinear, has_kernels, host, is_bf16, layers, linear_gelu, rotary_attention};
+use crate::{Rope, bilinear, has_kernels, is_bf16, layers, linear_gelu, rotary_attention};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::nn::conv::{Conv2dConfig, ConvTranspose2dConfig};
 use burn::nn::{LayerNormConfig, LinearConfig, PaddingConfig2d};
@@ -187,29 +187,6 @@ fn rotary_attention_equals_burns() {
 }
 
 #[test]
-fn attention_of_parts_equals_that_of_tensors() {
-    let attention = Attention { batch: 2, tokens: 67, heads: 2, head_dim: 8, in_bf16: false };
-    let (channels, tokens) = (16, 2 * 67);
-    let (qkv, dy) = (random(tokens * 3 * channels, 1), random(tokens * channels, 2));
-    let part = |i: usize| -> Vec<f32> {
-        qkv.chunks_exact(3 * channels).flat_map(|token| &token[i * channels..][..channels]).copied().collect()
-    };
-    let apart = [part(0), part(1), part(2)];
-    let Rope { cos, sin } = Rope::new(1, 67, 8, 100.0, &Device::flex());
-    let (cos, sin) = (host(cos), host(sin));
-    let rope = [&cos[..], &sin];
-    let (parts, tensors) =
-        (Tokens::parts(&qkv, channels), Tokens::apart(apart.each_ref().map(|x| &x[..]), channels));
-    let (result, logarithms) = attention.forward(parts, rope);
-    assert_eq!(result, attention.forward(tensors, rope).0);
-    let joined = attention.backward_parts(parts, rope, &logarithms, &dy);
-    let gradients = attention.backward(tensors, rope, &logarithms, &dy);
-    for (i, got) in joined.chunks_exact(channels).enumerate() {
-        assert_eq!(got, &gradients[i % 3][i / 3 * channels..][..channels]);
-    }
-}
-
-#[test]
 fn resizing_equals_burns() {
     for (from, to) in [([1, 1], [2, 2]), ([3, 5], [6, 10]), ([9, 2], [4, 7]), ([5, 6], [5, 13])] {
         for align_corners in [false, true] {
@@ -243,10 +220,11 @@ fn everything(in_bf16: bool) -> Vec<Vec<f32>> {
     add(&mut all, &norm, [&x, &weight[..80], &weight[..80], &dy[..x.len()]]);
     let attention = Attention { batch, tokens: 150, heads: 2, head_dim: 8, in_bf16 };
     let tables = [&dy[..150 * 8], &dy[150 * 8..][..150 * 8]];
-    let tokens = Tokens::parts(&x, 16);
+    let len = 2 * 150 * 16;
+    let tokens = [0, 1, 2].map(|part| &x[part * len..][..len]);
     let (result, logarithms) = attention.forward(tokens, tables);
     all.push(result);
-    all.push(attention.backward_parts(tokens, tables, &logarithms, &dy[..2 * 150 * 16]));
+    all.extend(attention.backward(tokens, tables, &logarithms, &dy[..len]));
     all
 }
 

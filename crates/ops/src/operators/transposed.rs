@@ -64,7 +64,7 @@ impl WithSimd for OutputGradients<'_> {
         for (group, tile_row) in (0..groups).flat_map(|group| (0..block.rows).map(move |row| (group, row))) {
             for (i, out) in lines.chunks_exact_mut(length).take(TILE).enumerate() {
                 let row = TILE * (block.row + tile_row) + i;
-                source.read(group, Some(row), (TILE * block.column) as isize, out);
+                source.read(simd, group, Some(row), (TILE * block.column) as isize, out);
                 let mut sum = [0.0; GROUP];
                 for pixel in out.as_chunks::<GROUP>().0 {
                     sum.iter_mut().zip(pixel).for_each(|(sum, x)| *sum += x);

@@ -10,7 +10,7 @@ use super::Conv3x3;
 use super::transposed::{Accumulate, OutputGradients, Taps};
 use crate::buffers::{Floats, take};
 use crate::winograd::GROUP;
-use crate::winograd::planes::{Planes, Transposer};
+use crate::winograd::planes::Planes;
 use crate::winograd::transforms::{Block, Inputs, POINTS, TILE, lines};
 
 /// Largest number of parts: enough for the cores of a desktop computer.
@@ -45,7 +45,7 @@ impl Conv3x3 {
     /// The products' sums `[36][outputs][inputs]`, channels in whole groups, over rows of tiles (image, first row,
     /// rows), and the sums of the output's gradient.
     fn part(&self, x: &[f32], dy: &[f32], blocks: &[(usize, usize, usize)]) -> (Floats, Vec<f64>) {
-        let (arch, transposer) = (Arch::new(), Transposer::new());
+        let arch = Arch::new();
         let (plane, columns) = (self.height * self.width, self.width.div_ceil(TILE));
         let [inputs, outputs] = [self.inputs, self.outputs].map(|n| n.next_multiple_of(GROUP));
         let part = columns.div_ceil(columns.div_ceil(self.block_tiles()));
@@ -56,8 +56,7 @@ impl Conv3x3 {
         let mut products = Floats::new(POINTS * outputs * inputs);
         let mut bias = vec![0.0; outputs];
         let mut add = false;
-        let image =
-            |data, rectified| Planes { data, height: self.height, width: self.width, rectified, transposer };
+        let image = |data, rectified| Planes { data, height: self.height, width: self.width, rectified };
         for &(i, row, rows) in blocks {
             let x = image(&x[i * self.inputs * plane..][..self.inputs * plane], self.rectified);
             let dy = image(&dy[i * self.outputs * plane..][..self.outputs * plane], false);

@@ -1,96 +1,55 @@
 //! Conversion between images `[C, H, W]` and the groups of 16 adjacent channels that the transforms read. Blocks of
 //! 16 × 16 values are transposed in registers, so no image is stored a second time.
 
+use pulp::{Simd, WithSimd};
+
 use super::GROUP;
 
 /// The values of 16 pixels in 16 channels.
 type Square = [[f32; GROUP]; GROUP];
 
-/// The way in which this processor transposes squares.
-#[derive(Debug, Clone, Copy)]
-pub struct Transposer {
+/// The transpose of a square, by shuffles where vectors have 16 values.
+#[inline(always)]
+#[cfg_attr(not(target_arch = "x86_64"), allow(unused_variables))]
+fn transposed<S: Simd>(simd: S, square: Square) -> Square {
     #[cfg(target_arch = "x86_64")]
-    wide: Option<pulp::x86::V4>,
-}
-
-impl Transposer {
-    pub fn new() -> Self {
-        Self {
-            #[cfg(target_arch = "x86_64")]
-            wide: pulp::x86::V4::try_new(),
-        }
+    if let Some(simd) = (&simd as &dyn std::any::Any).downcast_ref::<pulp::x86::V4>() {
+        return shuffled(*simd, square);
     }
-
-    /// Runs `op`, compiled for the widest vectors of this processor.
-    #[inline(always)]
-    fn run(self, op: impl WithTranspose) {
-        #[cfg(target_arch = "x86_64")]
-        if let Some(simd) = self.wide {
-            return simd.vectorize(
-                #[inline(always)]
-                || op.run(Wide(simd)),
-            );
-        }
-        op.run(Plain);
-    }
+    std::array::from_fn(|i| std::array::from_fn(|j| square[j][i]))
 }
 
-/// Work that needs a transposition.
-trait WithTranspose {
-    fn run(self, transpose: impl Transpose);
-}
-
-/// A way to transpose squares.
-trait Transpose: Copy {
-    fn square(self, square: Square) -> Square;
-}
-
-#[derive(Clone, Copy)]
-struct Plain;
-
-impl Transpose for Plain {
-    fn square(self, square: Square) -> Square {
-        std::array::from_fn(|i| std::array::from_fn(|j| square[j][i]))
-    }
-}
-
+/// [`transposed`] in four rounds of shuffles: of values, of pairs of values, of quarters and of halves.
+///
+/// Loops, because closures of `array::from_fn` are not compiled for the target's features.
 #[cfg(target_arch = "x86_64")]
-#[derive(Clone, Copy)]
-struct Wide(pulp::x86::V4);
-
-#[cfg(target_arch = "x86_64")]
-impl Transpose for Wide {
-    /// Four rounds of shuffles: of values, of pairs of values, of quarters and of halves.
-    ///
-    /// Loops, because closures of `array::from_fn` are not compiled for the target's features.
-    #[inline(always)]
-    fn square(self, square: Square) -> Square {
-        use std::arch::x86_64::{__m512, __m512d};
-        let f = self.0.avx512f;
-        let mut rows: [__m512; GROUP] = pulp::cast(square);
-        for i in (0..GROUP).step_by(2) {
-            let (a, b) = (rows[i], rows[i + 1]);
-            (rows[i], rows[i + 1]) = (f._mm512_unpacklo_ps(a, b), f._mm512_unpackhi_ps(a, b));
-        }
-        // Afterwards quarter q of row 4·i + j holds column 4·q + j of rows 4·i … 4·i + 3.
-        let mut pairs: [__m512d; GROUP] = pulp::cast(rows);
-        for i in (0..GROUP).step_by(4) {
-            let [a, b, c, d] = [pairs[i], pairs[i + 1], pairs[i + 2], pairs[i + 3]];
-            (pairs[i], pairs[i + 1]) = (f._mm512_unpacklo_pd(a, c), f._mm512_unpackhi_pd(a, c));
-            (pairs[i + 2], pairs[i + 3]) = (f._mm512_unpacklo_pd(b, d), f._mm512_unpackhi_pd(b, d));
-        }
-        let mut rows: [__m512; GROUP] = pulp::cast(pairs);
-        for distance in [4, 8] {
-            for i in 0..GROUP {
-                if i & distance == 0 {
-                    let (a, b) = (rows[i], rows[i + distance]);
-                    rows[i] = f._mm512_shuffle_f32x4::<0x88>(a, b);
-                    rows[i + distance] = f._mm512_shuffle_f32x4::<0xdd>(a, b);
-                }
+#[inline(always)]
+fn shuffled(simd: pulp::x86::V4, square: Square) -> Square {
+    use std::arch::x86_64::{__m512, __m512d};
+    let f = simd.avx512f;
+    let mut rows: [__m512; GROUP] = pulp::cast(square);
+    for i in (0..GROUP).step_by(2) {
+        let (a, b) = (rows[i], rows[i + 1]);
+        (rows[i], rows[i + 1]) = (f._mm512_unpacklo_ps(a, b), f._mm512_unpackhi_ps(a, b));
+    }
+    // Afterwards quarter q of row 4·i + j holds column 4·q + j of rows 4·i … 4·i + 3.
+    let mut pairs: [__m512d; GROUP] = pulp::cast(rows);
+    for i in (0..GROUP).step_by(4) {
+        let [a, b, c, d] = [pairs[i], pairs[i + 1], pairs[i + 2], pairs[i + 3]];
+        (pairs[i], pairs[i + 1]) = (f._mm512_unpacklo_pd(a, c), f._mm512_unpackhi_pd(a, c));
+        (pairs[i + 2], pairs[i + 3]) = (f._mm512_unpacklo_pd(b, d), f._mm512_unpackhi_pd(b, d));
+    }
+    let mut rows: [__m512; GROUP] = pulp::cast(pairs);
+    for distance in [4, 8] {
+        for i in 0..GROUP {
+            if i & distance == 0 {
+                let (a, b) = (rows[i], rows[i + distance]);
+                rows[i] = f._mm512_shuffle_f32x4::<0x88>(a, b);
+                rows[i + distance] = f._mm512_shuffle_f32x4::<0xdd>(a, b);
             }
         }
-        pulp::cast(rows)
     }
+    pulp::cast(rows)
 }
 
 /// max(x, 0) of every value.
@@ -109,7 +68,6 @@ pub struct Planes<'a> {
     pub width: usize,
     /// Reads max(image, 0).
     pub rectified: bool,
-    pub transposer: Transposer,
 }
 
 impl Planes<'_> {
@@ -124,7 +82,7 @@ impl Planes<'_> {
 
     /// Writes a part of a row of one group to `out` `[columns][16]`, from column `first` on, where −1 is the border.
     /// Pixels outside of the image are 0. `None` is a row outside of the image.
-    pub fn read(&self, group: usize, row: Option<usize>, first: isize, out: &mut [f32]) {
+    pub fn read<S: Simd>(&self, simd: S, group: usize, row: Option<usize>, first: isize, out: &mut [f32]) {
         let Some(row) = row.filter(|row| *row < self.height) else {
             out.fill(0.0);
             return;
@@ -138,7 +96,7 @@ impl Planes<'_> {
         let data = &self.data[group * GROUP * plane + row * self.width + from..];
         let channels = GROUP.min(self.channels() - group * GROUP);
         let pixels = out.as_chunks_mut().0;
-        self.transposer.run(Gather { data, plane, channels, rectified: self.rectified, pixels });
+        simd.vectorize(Gather { data, plane, channels, rectified: self.rectified, pixels });
     }
 }
 
@@ -151,9 +109,11 @@ struct Gather<'a> {
     pixels: &'a mut [[f32; GROUP]],
 }
 
-impl WithTranspose for Gather<'_> {
+impl WithSimd for Gather<'_> {
+    type Output = ();
+
     #[inline(always)]
-    fn run(self, transpose: impl Transpose) {
+    fn with_simd<S: Simd>(self, simd: S) {
         let Self { data, plane, channels, rectified, pixels } = self;
         let (squares, rest) = pixels.as_chunks_mut::<GROUP>();
         let mut done = 0;
@@ -171,7 +131,7 @@ impl WithTranspose for Gather<'_> {
                 if rectified {
                     rectify(&mut square);
                 }
-                *out = transpose.square(square);
+                *out = transposed(simd, square);
             }
             done = squares.len();
         }
@@ -184,7 +144,7 @@ impl WithTranspose for Gather<'_> {
             if rectified {
                 rectify(&mut square);
             }
-            out.copy_from_slice(&transpose.square(square)[..out.len()]);
+            out.copy_from_slice(&transposed(simd, square)[..out.len()]);
         }
     }
 }
@@ -199,15 +159,11 @@ pub struct Scatter<'a, 'b> {
     pub mask: Option<(&'a [f32], usize)>,
 }
 
-impl Scatter<'_, '_> {
-    pub fn run(self, transposer: Transposer) {
-        transposer.run(self);
-    }
-}
+impl WithSimd for Scatter<'_, '_> {
+    type Output = ();
 
-impl WithTranspose for Scatter<'_, '_> {
     #[inline(always)]
-    fn run(self, transpose: impl Transpose) {
+    fn with_simd<S: Simd>(self, simd: S) {
         let Self { pixels, planes, mask } = self;
         let (squares, rest) = pixels.as_chunks::<GROUP>().0.as_chunks::<GROUP>();
         let whole = squares.len() * GROUP;
@@ -224,7 +180,7 @@ impl WithTranspose for Scatter<'_, '_> {
                 }
             }
             for (i, square) in squares.iter().enumerate() {
-                let mut square = transpose.square(*square);
+                let mut square = transposed(simd, *square);
                 if mask.is_some() {
                     let mut given = [[0.0; GROUP]; GROUP];
                     for c in 0..GROUP {
@@ -242,7 +198,7 @@ impl WithTranspose for Scatter<'_, '_> {
         for (i, pixels) in (done..).zip(ragged.chain([rest])) {
             let mut square = [[0.0; GROUP]; GROUP];
             square[..pixels.len()].copy_from_slice(pixels);
-            let square = transpose.square(square);
+            let square = transposed(simd, square);
             let at = i * GROUP..i * GROUP + pixels.len();
             for (c, (plane, mut row)) in planes.iter_mut().zip(square).enumerate() {
                 if let Some((mask, stride)) = mask {
@@ -266,45 +222,14 @@ fn keep_positive(values: &mut [f32], x: &[f32]) {
 mod tests {
     use super::*;
 
-    /// 35 channels of 7 × 21 pixels to groups and back, with this processor's transposition and the plain one.
     #[test]
-    fn planes_become_groups_and_groups_become_planes() {
-        let (channels, height, width) = (35, 7, 21);
-        let plane = height * width;
-        let data: Vec<f32> = (0..channels * plane).map(|i| i as f32 - 2000.0).collect();
-        let plain = Transposer {
-            #[cfg(target_arch = "x86_64")]
-            wide: None,
-        };
-        for (transposer, rectified) in
-            [(plain, false), (plain, true), (Transposer::new(), false), (Transposer::new(), true)]
-        {
-            let planes = Planes { data: &data, height, width, rectified, transposer };
-            let mut out = vec![0.0; channels * plane];
-            for (group, out) in out.chunks_mut(GROUP * plane).enumerate() {
-                let mut pixels = vec![f32::NAN; plane * GROUP];
-                for (row, pixels) in pixels.chunks_exact_mut(width * GROUP).enumerate() {
-                    planes.read(group, Some(row), 0, pixels);
-                }
-                let mask = rectified.then(|| (&data[group * GROUP * plane..], plane));
-                let mut slices: Vec<_> = out.chunks_exact_mut(plane).collect();
-                Scatter { pixels: &pixels, planes: &mut slices, mask }.run(transposer);
-            }
-            let expected: Vec<f32> = data.iter().map(|x| if rectified { x.max(0.0) } else { *x }).collect();
-            assert_eq!(out, expected);
+    fn squares_are_transposed() {
+        let square: Square = std::array::from_fn(|i| std::array::from_fn(|j| (GROUP * i + j) as f32));
+        let turned = transposed(pulp::Scalar, square);
+        assert!((0..GROUP * GROUP).all(|i| turned[i % GROUP][i / GROUP] == i as f32));
+        #[cfg(target_arch = "x86_64")]
+        if let Some(simd) = pulp::x86::V4::try_new() {
+            assert_eq!(transposed(simd, square), turned);
         }
-    }
-
-    #[test]
-    fn outside_of_the_image_everything_is_0() {
-        let data: Vec<f32> = (1..=6).map(|i| i as f32).collect();
-        let planes =
-            Planes { data: &data, height: 2, width: 3, rectified: false, transposer: Transposer::new() };
-        let mut out = vec![f32::NAN; 5 * GROUP];
-        planes.read(0, Some(1), -1, &mut out);
-        let first: Vec<f32> = out.iter().step_by(GROUP).copied().collect();
-        assert_eq!(first, [0.0, 4.0, 5.0, 6.0, 0.0]);
-        planes.read(0, Some(2), 0, &mut out);
-        assert_eq!(out, [0.0; 5 * GROUP]);
     }
 }

@@ -160,7 +160,7 @@ impl WithSimd for Inputs<'_> {
         for (group, tile_row) in (0..groups).flat_map(|group| (0..block.rows).map(move |row| (group, row))) {
             for (i, out) in lines.chunks_exact_mut(length).enumerate() {
                 let row = (TILE * (block.row + tile_row) + i).checked_sub(1);
-                source.read(group, row, first, out);
+                source.read(simd, group, row, first, out);
             }
             let planes = out.chunks_exact_mut(stride * GROUP).skip(group).step_by(groups);
             spread(

@@ -2,9 +2,10 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use snapsnap_base::{FileError, file, quoted};
@@ -27,6 +28,15 @@ const SIDED_BONES: [&str; 9] =
 
 /// Morph target: index and displacement in metres of each vertex that moves.
 pub type Target = Arc<Vec<(u32, Vec3)>>;
+
+/// A face of an OBJ with three or four corners.
+#[derive(Debug, Clone)]
+pub struct Face {
+    pub group: String,
+    pub rows: Vec<u32>,
+    /// Missing ones are 0.
+    pub texcoords: Vec<Vec2>,
+}
 
 /// Faces of each group of the base mesh. Triangles repeat their last corner.
 type Groups = HashMap<String, Vec<[u32; 4]>>;
@@ -75,7 +85,12 @@ impl Library {
             let message = "is no MakeHuman data: neither it nor its folder `data` has 3dobjs/base.obj";
             FileError::unsuitable(folder, message)
         })?;
-        let (positions, groups) = read_base(&root.join(base))?;
+        let (positions, faces) = read_obj(&root.join(base))?;
+        let mut groups = Groups::new();
+        for Face { group, rows, .. } in faces {
+            let corners = [0, 1, 2, 3].map(|i: usize| rows[i.min(rows.len() - 1)]);
+            groups.entry(group).or_default().push(corners);
+        }
         if let Some(group) = GROUPS.iter().find(|group| !groups.contains_key(**group)) {
             return Err(FileError::unsuitable(&root.join(base), format!("has no group `{group}`")));
         }
@@ -137,39 +152,49 @@ pub fn vector<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
     Some(METRES * Vec3::new(next()?, next()?, next()?))
 }
 
+/// The next N numbers.
+pub fn numbers<'a, T: FromStr, const N: usize>(words: &mut impl Iterator<Item = &'a str>) -> Option<[T; N]> {
+    let values: Option<Vec<T>> = (0..N).map(|_| words.next()?.parse().ok()).collect();
+    values?.try_into().ok()
+}
+
 fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T, FileError> {
     serde_json::from_str(&read_text(path)?).map_err(|e| FileError::unsuitable(path, e))
 }
 
-/// Reads positions and groups. The importer of `snapsnap_mesh` would renumber vertices, to which targets and weights
-/// refer.
-fn read_base(path: &Path) -> Result<(Vec<Vec3>, Groups), FileError> {
+/// Positions in metres and faces of an OBJ. The importer of `snapsnap_mesh` would renumber vertices, to which targets,
+/// weights and bindings refer.
+pub fn read_obj(path: &Path) -> Result<(Vec<Vec3>, Vec<Face>), FileError> {
     let text = read_text(path)?;
-    let mut positions = Vec::new();
-    let mut groups = Groups::new();
-    let mut group = String::new();
+    let (mut positions, mut places, mut faces, mut group) = (Vec::new(), Vec::new(), Vec::new(), "");
     for (number, line) in text.lines().enumerate() {
         let mut words = line.split_ascii_whitespace();
+        let bad = || wrong(path, number, line);
         match words.next() {
-            Some("v") => positions.push(vector(words).ok_or_else(|| wrong(path, number, line))?),
-            Some("g") => group = words.next().unwrap_or_default().to_owned(),
+            Some("v") => positions.push(vector(words).ok_or_else(bad)?),
+            Some("vt") => {
+                let at = numbers(&mut words).filter(|at: &[f32; 2]| at.iter().all(|v| v.abs() < LARGEST));
+                places.push(Vec2::from(at.ok_or_else(bad)?));
+            }
+            Some("g") => group = words.next().unwrap_or_default(),
             Some("f") => {
-                let row = |word: &str| {
-                    let row: usize = word.split('/').next()?.parse().ok()?;
-                    (1..=positions.len()).contains(&row).then(|| row as u32 - 1)
+                let corner = |word: &str| {
+                    let mut parts = word.split('/');
+                    let row: usize = parts.next()?.parse().ok()?;
+                    let place =
+                        parts.next().and_then(|part| places.get(part.parse::<usize>().ok()?.checked_sub(1)?));
+                    let is_vertex = (1..=positions.len()).contains(&row);
+                    is_vertex.then(|| (row as u32 - 1, place.copied().unwrap_or_default()))
                 };
-                let rows: Option<Vec<u32>> = words.map(row).collect();
-                let face = match rows.as_deref() {
-                    Some([a, b, c, d]) => [*a, *b, *c, *d],
-                    Some([a, b, c]) => [*a, *b, *c, *c],
-                    _ => return Err(wrong(path, number, line)),
-                };
-                groups.entry(group.clone()).or_default().push(face);
+                let corners: Option<Vec<(u32, Vec2)>> = words.map(corner).collect();
+                let corners = corners.filter(|corners| (3..=4).contains(&corners.len())).ok_or_else(bad)?;
+                let (rows, texcoords) = corners.into_iter().unzip();
+                faces.push(Face { group: group.to_owned(), rows, texcoords });
             }
             _ => {}
         }
     }
-    Ok((positions, groups))
+    Ok((positions, faces))
 }
 
 fn read_target(path: &Path, vertices: usize) -> Result<Vec<(u32, Vec3)>, FileError> {

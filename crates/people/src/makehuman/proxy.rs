@@ -1,7 +1,6 @@
 //! Clothes, hair, hats and shoes of MakeHuman's asset collection: meshes bound to the base mesh (`.mhclo` and `.obj`).
 
 use std::path::Path;
-use std::str::FromStr;
 use std::sync::Arc;
 
 use glam::{Vec2, Vec3};
@@ -9,7 +8,7 @@ use rand::Rng;
 use snapsnap_base::FileError;
 use snapsnap_mesh::mesh::pieces;
 
-use super::files::{METRES, read_text, vector, wrong};
+use super::files::{Face, METRES, numbers, read_obj, read_text, vector, wrong};
 use super::patch::{Patch, Vertex};
 use crate::pattern::Pattern;
 use crate::synth::outfit::{Cut, Outfit};
@@ -48,9 +47,6 @@ struct Binding {
 /// Two vertices of the base mesh, and the distance along an axis, metres, for which the offsets were made.
 type Scale = ([u32; 2], f32);
 
-/// A face: its vertices, and their texture coordinates.
-type Corners = (Vec<u32>, Vec<Vec2>);
-
 /// A proxy.
 #[derive(Debug, Clone)]
 pub struct Proxy {
@@ -63,8 +59,7 @@ pub struct Proxy {
     scales: [Option<Scale>; 3],
     /// By vertex of the base mesh: whether the proxy covers it, so that it is left out.
     pub hides: Vec<bool>,
-    /// Faces of three or four corners.
-    faces: Vec<Corners>,
+    faces: Vec<Face>,
 }
 
 /// A proxy on a body, in connected pieces.
@@ -146,12 +141,6 @@ impl Worn {
     }
 }
 
-/// The next N numbers.
-fn numbers<'a, T: FromStr, const N: usize>(words: &mut impl Iterator<Item = &'a str>) -> Option<[T; N]> {
-    let values: Option<Vec<T>> = (0..N).map(|_| words.next()?.parse().ok()).collect();
-    values?.try_into().ok()
-}
-
 impl Proxy {
     /// Reads a proxy for a base mesh of `vertices` vertices.
     ///
@@ -201,8 +190,14 @@ impl Proxy {
         }
         let name = mesh.and_then(|name| Path::new(name).file_name());
         let name = name.ok_or_else(|| FileError::unsuitable(path, "names no `obj_file`"))?;
-        proxy.faces = read_faces(&path.with_file_name(name), proxy.bindings.len())?;
-        Ok(proxy)
+        let (path, bindings) = (path.with_file_name(name), proxy.bindings.len());
+        let (positions, faces) = read_obj(&path)?;
+        if positions.len() != bindings || faces.is_empty() {
+            let (vertices, faces) = (positions.len(), faces.len());
+            let message = format!("has {vertices} vertices and {faces} faces for {bindings} bindings");
+            return Err(FileError::unsuitable(&path, message));
+        }
+        Ok(Self { faces, ..proxy })
     }
 
     /// Fits the proxy to a body. `bones` moves a resting point by the skin weights of a mixture of base mesh vertices.
@@ -232,9 +227,9 @@ impl Proxy {
             Vertex { rest, posed: bones(&kept, rest), parts }
         };
         let vertices: Vec<Vertex> = self.bindings.iter().map(vertex).collect();
-        let patch = Patch { vertices, faces: self.faces.iter().map(|(rows, _)| rows.clone()).collect() };
+        let patch = Patch { vertices, faces: self.faces.iter().map(|face| face.rows.clone()).collect() };
         let pieces = pieces(patch.vertices.len(), patch.faces.iter().map(|face| &face[..]));
-        let texcoords = self.faces.iter().map(|(_, texcoords)| texcoords.clone()).collect();
+        let texcoords = self.faces.iter().map(|face| face.texcoords.clone()).collect();
         Fitted { patch, texcoords, pieces }
     }
 }
@@ -289,41 +284,4 @@ fn hide(line: &str, hides: &mut [bool]) -> Option<()> {
         (last, is_range) = (Some(row), false);
     }
     Some(())
-}
-
-/// Faces of an OBJ of `vertices` vertices. Missing texture coordinates are 0.
-fn read_faces(path: &Path, vertices: usize) -> Result<Vec<Corners>, FileError> {
-    let text = read_text(path)?;
-    let (mut count, mut texcoords, mut faces) = (0, Vec::new(), Vec::new());
-    for (number, line) in text.lines().enumerate() {
-        let mut words = line.split_ascii_whitespace();
-        match words.next() {
-            Some("v") => count += 1,
-            Some("vt") => {
-                let at = numbers(&mut words).filter(|at: &[f32; 2]| at.iter().all(|v| v.abs() < 1000.0));
-                texcoords.push(Vec2::from(at.ok_or_else(|| wrong(path, number, line))?));
-            }
-            Some("f") => {
-                let corner = |word: &str| {
-                    let mut parts = word.split('/');
-                    let row: usize = parts.next()?.parse().ok()?;
-                    let row = (1..=vertices).contains(&row).then(|| row as u32 - 1)?;
-                    let place = match parts.next().filter(|part| !part.is_empty()) {
-                        Some(part) => *texcoords.get(part.parse::<usize>().ok()?.checked_sub(1)?)?,
-                        None => Vec2::ZERO,
-                    };
-                    Some((row, place))
-                };
-                let face: Option<Vec<(u32, Vec2)>> = words.map(corner).collect();
-                let face = face.filter(|face| (3..=4).contains(&face.len()));
-                faces.push(face.ok_or_else(|| wrong(path, number, line))?.into_iter().unzip());
-            }
-            _ => {}
-        }
-    }
-    if count != vertices || faces.is_empty() {
-        let message = format!("has {count} vertices and {} faces for {vertices} bindings", faces.len());
-        return Err(FileError::unsuitable(path, message));
-    }
-    Ok(faces)
 }

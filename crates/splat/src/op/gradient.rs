@@ -4,7 +4,6 @@ use cubecl::prelude::*;
 
 use super::inputs::Wanted;
 use super::job::Job;
-use super::splat::Offset;
 use crate::linear::{Vec3, add3, load3};
 use crate::projection::FootprintGradient;
 
@@ -70,18 +69,6 @@ impl SplatGradient {
                 depth: 0.0f32,
             },
         }
-    }
-
-    /// Adds a pixel to the sums r and S: `w` is its offset, `g` the gradient of its power (see [`crate::projection`]).
-    #[inline(always)]
-    pub fn add_shape(&mut self, g: f32, w: &Offset) {
-        let g_0 = g * w.w0;
-        let g_1 = g * w.w1;
-        self.footprint.r0 += g_0;
-        self.footprint.r1 += g_1;
-        self.footprint.s00 += g_0 * w.w0;
-        self.footprint.s01 += g_0 * w.w1;
-        self.footprint.s11 += g_1 * w.w1;
     }
 
     /// Adds the record that starts at index `at`.

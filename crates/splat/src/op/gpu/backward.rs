@@ -17,7 +17,7 @@ use crate::linear::{Quat, Vec3, add3, dot, load3, store3};
 use crate::op::gradient::{Record, SplatGradient};
 use crate::op::inputs::Wanted;
 use crate::op::job::channels;
-use crate::op::splat::{Offset, Splat, Uniforms, offset, unclamped_alpha};
+use crate::op::splat::{Splat, Uniforms, offset, unclamped_alpha};
 use crate::options::MIN_ALPHA;
 use crate::projection::{GaussianGradient, footprint, project, project_vjp, to_camera};
 
@@ -101,7 +101,7 @@ pub fn pixels(
 
     let mut visit = BackToFront { transmittance: 1.0f32, sum: 0.0f32 };
     let mut list_end = 0u32;
-    let mut own = no_upstream();
+    let mut own = Upstream { color: Vec3 { x: 0.0f32, y: 0.0f32, z: 0.0f32 }, alpha: 0.0f32, depth: 0.0f32 };
     if pixel.inside {
         own = load_upstream(upstream, &pixel, depth);
         list_end = list_ends[pixel.index];
@@ -155,13 +155,33 @@ pub fn pixels(
             let first = in_round * comptime!(UNITS);
             for i in 0..comptime!(SHARE) {
                 let at = i * comptime!(SHARERS) + unit % comptime!(SHARERS);
-                let mut v_power = 0.0f32;
-                if comptime!(shape) {
-                    v_power = v_powers[first + at];
+                let blend_weight = blend_weights[first + at];
+                if comptime!(record.colors) {
+                    gradient.color.x += blend_weight * upstreams[at];
+                    gradient.color.y += blend_weight * upstreams[comptime!(UNITS) + at];
+                    gradient.color.z += blend_weight * upstreams[comptime!(2 * UNITS) + at];
                 }
-                let other = pixel_of_unit(at as u32, uniforms);
-                let w = offset(&splat, other.x, other.y);
-                add_pixel(&mut gradient, blend_weights[first + at], v_power, &w, &upstreams, at, record);
+                if comptime!(record.depth) {
+                    gradient.footprint.depth += blend_weight * upstreams[comptime!(3 * UNITS) + at];
+                }
+                if comptime!(shape) {
+                    let v_power = v_powers[first + at];
+                    if comptime!(record.opacities) {
+                        gradient.opacity += v_power;
+                    }
+                    // The sums r and S (see `crate::projection`).
+                    if comptime!(record.geometry) {
+                        let other = pixel_of_unit(at as u32, uniforms);
+                        let w = offset(&splat, other.x, other.y);
+                        let g_0 = v_power * w.w0;
+                        let g_1 = v_power * w.w1;
+                        gradient.footprint.r0 += g_0;
+                        gradient.footprint.r1 += g_1;
+                        gradient.footprint.s00 += g_0 * w.w0;
+                        gradient.footprint.s01 += g_0 * w.w1;
+                        gradient.footprint.s11 += g_1 * w.w1;
+                    }
+                }
             }
             gradient.opacity /= splat.opacity;
         }
@@ -183,38 +203,6 @@ pub fn pixels(
         }
         rest -= rest.min(comptime!(ROUND));
     }
-}
-
-/// Adds the part of pixel `at` of the tile to the sums of a splat.
-#[cube]
-fn add_pixel(
-    gradient: &mut SplatGradient,
-    blend_weight: f32,
-    v_power: f32,
-    w: &Offset,
-    upstreams: &[f32],
-    at: usize,
-    #[comptime] record: Record,
-) {
-    if comptime!(record.colors) {
-        gradient.color.x += blend_weight * upstreams[at];
-        gradient.color.y += blend_weight * upstreams[comptime!(UNITS) + at];
-        gradient.color.z += blend_weight * upstreams[comptime!(2 * UNITS) + at];
-    }
-    if comptime!(record.depth) {
-        gradient.footprint.depth += blend_weight * upstreams[comptime!(3 * UNITS) + at];
-    }
-    if comptime!(record.opacities) {
-        gradient.opacity += v_power;
-    }
-    if comptime!(record.geometry) {
-        gradient.add_shape(v_power, w);
-    }
-}
-
-#[cube]
-fn no_upstream() -> Upstream {
-    Upstream { color: Vec3 { x: 0.0f32, y: 0.0f32, z: 0.0f32 }, alpha: 0.0f32, depth: 0.0f32 }
 }
 
 #[cube]
