@@ -3,7 +3,8 @@
 use glam::{DVec3, Vec3};
 use snapsnap_splat::Camera;
 
-use crate::network::pixel_width;
+use crate::config::OPPOSITE;
+use crate::network::{View, nominal_camera, pixel_width};
 use crate::valid_pixels::{STEEPEST, without_steep};
 
 /// Largest distance between both edges, metres: a head with hair is not longer.
@@ -11,7 +12,8 @@ const LONGEST: f32 = 0.35;
 /// Largest difference in height of two edges that belong to one surface, metres.
 const STEP: f32 = 0.05;
 
-/// The surface between the upper edges of front and back, stored like the map of a view. Columns are the columns of
+/// The surface between the upper edges of front and back, stored like the map of a view. It is a parabola that touches
+/// both edges' lines of sight: the silhouettes tell no more. Columns are the columns of
 /// the front's canvas. Rows lead from the front's edge backwards.
 pub struct Top {
     /// `[3, S, S]` colours in [−1, 1].
@@ -37,6 +39,8 @@ impl Top {
         let pixel = pixel_width(side);
         let nominal = Camera::orbit_at_yaw_degrees(0.0, side as u32);
         let up = (nominal.world_to_camera.rotation * DVec3::Y).as_vec3();
+        let eyes =
+            [View::Front, View::Back].map(|view| nominal_camera(view, OPPOSITE, side).centre().as_vec3());
         let [front, mut back] = [0, 1].map(|view| edges(colors[view], points[view], valid[view], side));
         back.sort_by(|(_, a), (_, b)| a.point.x.total_cmp(&b.point.x));
 
@@ -50,11 +54,13 @@ impl Top {
             if way.z <= 0.0 || length > LONGEST || rise.abs() > STEP {
                 continue;
             }
+            let middle = crossing(eyes, [near.point, far.point]);
             let steps = (length / pixel).round() as usize;
             for step in 1..steps.min(side + 1) {
                 let (i, share) = ((step - 1) * side + column, step as f32 / steps as f32);
                 top.valid[i] = true;
-                top.points[3 * i..3 * i + 3].copy_from_slice(&near.point.lerp(far.point, share).to_array());
+                let point = near.point.lerp(middle, share).lerp(middle.lerp(far.point, share), share);
+                top.points[3 * i..3 * i + 3].copy_from_slice(&point.to_array());
                 let color = near.color.lerp(far.color, share).to_array();
                 (0..3).for_each(|c| top.image[c * area + i] = color[c]);
             }
@@ -62,6 +68,19 @@ impl Top {
         without_steep(&mut top.valid, &top.points, side, STEEPEST);
         top.valid.contains(&true).then_some(top)
     }
+}
+
+/// Where the lines of sight from these eyes through these points come closest, behind the points. The middle of the
+/// points if they part there.
+fn crossing(eyes: [Vec3; 2], points: [Vec3; 2]) -> Vec3 {
+    let [a, b] = [0, 1].map(|i| (points[i] - eyes[i]).normalize_or_zero());
+    let (apart, cosine) = (points[0] - points[1], a.dot(b));
+    let sine_squared = 1.0 - cosine * cosine;
+    let behind = [cosine * b.dot(apart) - a.dot(apart), b.dot(apart) - cosine * a.dot(apart)];
+    let [first, second] = behind.map(|distance| distance / sine_squared);
+    let is_crossed = [first, second].iter().all(|distance| (0.0..apart.length()).contains(distance));
+    let (first, second) = if is_crossed { (first * a, second * b) } else { (Vec3::ZERO, Vec3::ZERO) };
+    (points[0] + first).midpoint(points[1] + second)
 }
 
 /// Upper edges of a view, each with its column.
@@ -118,18 +137,36 @@ mod tests {
     }
 
     #[test]
-    fn a_box_is_closed_level_and_in_the_colours_of_both_edges() {
+    fn a_box_is_closed_by_a_dome_in_the_colours_of_both_edges() {
         let top = boxed(0.3, 0.0).expect("points");
-        let world = Camera::orbit_at_yaw_degrees(0.0, 64).world_to_camera.inverse();
+        let nominal = Camera::orbit_at_yaw_degrees(0.0, 64);
+        let world = nominal.world_to_camera.inverse();
         let at = |i: usize| Vec3::from_slice(&top.points[3 * i..3 * i + 3]).as_dvec3();
         let inside: Vec<usize> = (0..64 * 64).filter(|i| top.valid[*i]).collect();
         // A pixel is 3.9 cm wide: 30 cm have seven inner points. The back has no neighbour beyond the last column.
         assert_eq!(inside.len(), 7 * 11);
+        // Lines of sight from below rise to above the middle of the box. The dome is half as high.
+        let eye = nominal.centre();
+        let slope = (1.7 - eye.y) / (eye.z - 0.15);
         for i in inside {
             let (point, row) = (world.apply(at(i)), i / 64 + 1);
-            assert!((point.y - 1.7).abs() < 1e-5, "{point}");
-            assert!((point.z - (0.15 - 0.3 * row as f64 / 8.0)).abs() < 1e-5, "{point}");
-            assert!((top.image[i] - (0.5 - row as f32 / 8.0)).abs() < 1e-5);
+            let share = row as f64 / 8.0;
+            let height = 1.7 + slope * 0.15 * 2.0 * share * (1.0 - share);
+            assert!((point.y - height).abs() < 2e-3, "{point}, not {height}");
+            assert!((point.z - (0.15 - 0.3 * share)).abs() < 2e-3, "{point}");
+            assert!((top.image[i] - (0.5 - share as f32)).abs() < 1e-5);
+        }
+    }
+
+    #[test]
+    fn lines_of_sight_cross_behind_their_points_or_not_at_all() {
+        let eyes = [Vec3::ZERO, Vec3::new(0.0, 0.0, 4.0)];
+        let points = |y: f32| [Vec3::new(0.0, y, 1.9), Vec3::new(0.0, y, 2.1)];
+        let middle = crossing(eyes, points(0.95));
+        assert!(middle.distance(Vec3::new(0.0, 1.0, 2.0)) < 1e-5, "{middle}");
+        // Level lines do not cross at one place, lines that part cross before their points.
+        for (eyes, points) in [(eyes, points(0.0)), (eyes.map(|eye| -eye), points(0.95))] {
+            assert_eq!(crossing(eyes, points), points[0].midpoint(points[1]));
         }
     }
 
