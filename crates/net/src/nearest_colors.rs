@@ -15,8 +15,8 @@ const NEAR: f32 = 0.05;
 /// Least number of points in a thinned cloud.
 const THINNED: usize = 20_000;
 
-/// Pixels to each side of a photograph's pixel among which a colour is the most usual one. A third of
-/// the rows and columns is enough.
+/// Pixels to each side of a photograph's pixel among which a colour is the most usual one. A third of the
+/// rows and columns is enough.
 const REACH: usize = 6;
 const STEP: usize = 3;
 

@@ -177,7 +177,7 @@ impl WithSimd for Inputs<'_> {
 }
 
 /// Transforms N rows of `lines` into six, in place, and then N columns of each tile into six, for the 36 `planes`
-/// `[stride][16]` of one group. `points` transforms N values.
+/// `[stride][16]` of one group. `points` transforms N values; unless it is inlined, every vector instruction is a call.
 #[inline(always)]
 pub fn spread<'a, S: Simd, const N: usize>(
     simd: S,
