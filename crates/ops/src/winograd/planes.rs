@@ -222,14 +222,46 @@ fn keep_positive(values: &mut [f32], x: &[f32]) {
 mod tests {
     use super::*;
 
+    /// 35 channels of 7 × 21 pixels to groups and back.
+    fn groups_and_back<S: Simd>(simd: S) {
+        let (channels, height, width) = (35, 7, 21);
+        let plane = height * width;
+        let data: Vec<f32> = (0..channels * plane).map(|i| i as f32 - 2000.0).collect();
+        for rectified in [false, true] {
+            let planes = Planes { data: &data, height, width, rectified };
+            let mut out = vec![0.0; channels * plane];
+            for (group, out) in out.chunks_mut(GROUP * plane).enumerate() {
+                let mut pixels = vec![f32::NAN; plane * GROUP];
+                for (row, pixels) in pixels.chunks_exact_mut(width * GROUP).enumerate() {
+                    planes.read(simd, group, Some(row), 0, pixels);
+                }
+                let mask = rectified.then(|| (&data[group * GROUP * plane..], plane));
+                let mut slices: Vec<_> = out.chunks_exact_mut(plane).collect();
+                simd.vectorize(Scatter { pixels: &pixels, planes: &mut slices, mask });
+            }
+            let expected: Vec<f32> = data.iter().map(|x| if rectified { x.max(0.0) } else { *x }).collect();
+            assert_eq!(out, expected);
+        }
+    }
+
     #[test]
-    fn squares_are_transposed() {
-        let square: Square = std::array::from_fn(|i| std::array::from_fn(|j| (GROUP * i + j) as f32));
-        let turned = transposed(pulp::Scalar, square);
-        assert!((0..GROUP * GROUP).all(|i| turned[i % GROUP][i / GROUP] == i as f32));
+    fn planes_become_groups_and_groups_become_planes() {
+        groups_and_back(pulp::Scalar);
         #[cfg(target_arch = "x86_64")]
         if let Some(simd) = pulp::x86::V4::try_new() {
-            assert_eq!(transposed(simd, square), turned);
+            groups_and_back(simd);
         }
+    }
+
+    #[test]
+    fn outside_of_the_image_everything_is_0() {
+        let data: Vec<f32> = (1..=6).map(|i| i as f32).collect();
+        let planes = Planes { data: &data, height: 2, width: 3, rectified: false };
+        let mut out = vec![f32::NAN; 5 * GROUP];
+        planes.read(pulp::Scalar, 0, Some(1), -1, &mut out);
+        let first: Vec<f32> = out.iter().step_by(GROUP).copied().collect();
+        assert_eq!(first, [0.0, 4.0, 5.0, 6.0, 0.0]);
+        planes.read(pulp::Scalar, 0, Some(2), 0, &mut out);
+        assert_eq!(out, [0.0; 5 * GROUP]);
     }
 }

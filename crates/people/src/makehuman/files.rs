@@ -34,7 +34,7 @@ pub type Target = Arc<Vec<(u32, Vec3)>>;
 pub struct Face {
     pub group: String,
     pub rows: Vec<u32>,
-    /// Missing ones are 0.
+    /// 0 where the file has none.
     pub texcoords: Vec<Vec2>,
 }
 
@@ -181,10 +181,12 @@ pub fn read_obj(path: &Path) -> Result<(Vec<Vec3>, Vec<Face>), FileError> {
                 let corner = |word: &str| {
                     let mut parts = word.split('/');
                     let row: usize = parts.next()?.parse().ok()?;
-                    let place =
-                        parts.next().and_then(|part| places.get(part.parse::<usize>().ok()?.checked_sub(1)?));
                     let is_vertex = (1..=positions.len()).contains(&row);
-                    is_vertex.then(|| (row as u32 - 1, place.copied().unwrap_or_default()))
+                    let place = match parts.next().filter(|part| !part.is_empty() && !places.is_empty()) {
+                        Some(part) => *places.get(part.parse::<usize>().ok()?.checked_sub(1)?)?,
+                        None => Vec2::ZERO,
+                    };
+                    is_vertex.then(|| (row as u32 - 1, place))
                 };
                 let corners: Option<Vec<(u32, Vec2)>> = words.map(corner).collect();
                 let corners = corners.filter(|corners| (3..=4).contains(&corners.len())).ok_or_else(bad)?;

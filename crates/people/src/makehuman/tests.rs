@@ -162,6 +162,7 @@ fn damaged_proxies_are_named() {
         (sound.replace("obj_file a.obj", ""), faces.into(), "names no `obj_file`"),
         (sound.replace("a.obj", "../b.obj"), faces.into(), "b.obj: cannot read"),
         (sound.into(), faces.replace("3/3", "4/3"), "a.obj: line 7"),
+        (sound.into(), faces.replace("3/3", "3/4"), "a.obj: line 7"),
         (sound.into(), format!("v 0 0 0\n{faces}"), "has 4 vertices and 1 faces for 3 bindings"),
     ] {
         let error = read(&text, &obj).expect_err(expected);
