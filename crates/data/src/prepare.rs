@@ -112,6 +112,11 @@ impl Schema for DataConfig {
 }
 
 impl DataConfig {
+    /// Side of the largest pictures.
+    pub fn largest_side(&self) -> u32 {
+        if self.views.high_resolution { 2 * self.views.resolution } else { self.views.resolution }
+    }
+
     /// Description of a data set with this config.
     pub fn description(&self, source: &str) -> Description {
         let ViewsConfig { count, arrangement, resolution, high_resolution, second_depth, layout, .. } =

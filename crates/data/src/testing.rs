@@ -9,13 +9,13 @@ use crate::dataset::{Folder, Layout, Split};
 use crate::prepare::DataConfig;
 use crate::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
-use snapsnap_people::synth;
+use snapsnap_people::{Detail, synth};
 
 /// One synthetic person in front of the cameras.
 pub fn person() -> &'static Mesh {
     static PERSON: OnceLock<Mesh> = OnceLock::new();
     PERSON.get_or_init(|| {
-        let mut mesh = synth::person("train/1/25", None);
+        let mut mesh = synth::person("train/1/25", None, Detail::Fine);
         normalise(&mut mesh, Collection::Other, None).expect("has height");
         mesh
     })

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_people::makehuman::{self, Library};
-use snapsnap_people::synth;
+use snapsnap_people::{Detail, synth};
 
 /// People of each kind.
 const COUNT: usize = 20;
@@ -23,12 +23,12 @@ fn measure(kind: &str, make: impl Fn(&str) -> Mesh) {
 
 fn main() {
     println!("| people | each | per minute | triangles |\n|---|---:|---:|---:|");
-    measure("synthetic", |name| synth::person(name, None));
+    measure("synthetic", |name| synth::person(name, None, Detail::Fine));
     // Cargo adds flags.
     match std::env::args().skip(1).find(|argument| !argument.starts_with('-')) {
         Some(folder) => {
             let library = Library::open(Path::new(&folder)).expect("MakeHuman's data");
-            measure("MakeHuman", |name| makehuman::person(&library, name, None).expect("made"));
+            measure("MakeHuman", |name| makehuman::person(&library, name, None, Detail::Fine).expect("made"));
         }
         None => println!("SKIPPED: MakeHuman people, no folder of its data was given"),
     }

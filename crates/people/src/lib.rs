@@ -2,6 +2,7 @@
 //! characters from files ([`avatars`]).
 
 pub mod avatars;
+mod detail;
 mod figure;
 mod joint_names;
 pub mod makehuman;
@@ -10,3 +11,5 @@ mod pattern;
 pub mod poses;
 mod skeleton;
 pub mod synth;
+
+pub use detail::Detail;

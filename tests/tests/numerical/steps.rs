@@ -15,7 +15,7 @@ use snapsnap_net::config::{Anchor, Body, Precision, Sides};
 use snapsnap_net::network::{PointMap, View, activate};
 use snapsnap_net::weights::{random_predictor, random_regressors};
 use snapsnap_net::{Prediction, Window};
-use snapsnap_people::synth;
+use snapsnap_people::{Detail, synth};
 use snapsnap_tests::{TRAINING, device, device_name, is_software, relative_error, values};
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::gradients;
@@ -42,8 +42,9 @@ fn people(root: &std::path::Path) -> Arc<Folder> {
     (config.views.count, config.views.resolution) = (4, 64);
     config.views.second_depth = true;
     // With most other people, rounding alone turns AdamW's first step around for elements of almost no gradient.
-    let person =
-        |index: usize| (Split::Train, format!("{index:04}"), synth::person(&format!("stride/{index}"), None));
+    let person = |index: usize| {
+        (Split::Train, format!("{index:04}"), synth::person(&format!("stride/{index}"), None, Detail::Fine))
+    };
     config.make(&root.join("people"), "test", (0..2).map(person)).expect("makes")
 }
 

@@ -7,7 +7,7 @@ use clap::Args;
 use snapsnap_eval::stability::{Case, Row, networks, report, run as run_case, splats};
 use snapsnap_mesh::view::{Renderer, ViewOptions};
 use snapsnap_net::Photograph;
-use snapsnap_people::synth;
+use snapsnap_people::{Detail, synth};
 use snapsnap_splat::Camera;
 use snapsnap_train::stability as training;
 
@@ -42,7 +42,7 @@ pub struct Arguments {
 
 /// A synthetic person from the front and the back, on a canvas of `side`² pixels.
 fn photographs(side: usize) -> [Photograph; 2] {
-    let mesh = synth::person("stability", None);
+    let mesh = synth::person("stability", None, Detail::Fine);
     let renderer = Renderer::new(&mesh).expect("a synthetic person can be drawn");
     [0.0, 180.0].map(|yaw| {
         let view = renderer.draw(&Camera::orbit_at_yaw_degrees(yaw, side as u32), &ViewOptions::default());

@@ -153,8 +153,10 @@ impl DepthMap {
     fn add(&mut self, [a, b, c]: [Vec3; 3]) {
         let (low, high) = (a.min(b).min(c), a.max(b).max(c));
         let last = (self.side - 1) as f32;
-        let columns = low.x.ceil().max(0.0) as usize..(high.x.floor().min(last) + 1.0) as usize;
-        let rows = low.y.ceil().max(0.0) as usize..(high.y.floor().min(last) + 1.0) as usize;
+        // Casts truncate. Without SSE4.1, floor and ceil are function calls.
+        let ceil = |x: f32| x as usize + usize::from((x as usize as f32) < x);
+        let columns = ceil(low.x)..high.x.min(last) as usize + 1;
+        let rows = ceil(low.y)..high.y.min(last) as usize + 1;
         let normal = (b - a).cross(c - a);
         if columns.is_empty() || rows.is_empty() || normal.z == 0.0 {
             return;
@@ -183,9 +185,8 @@ impl DepthMap {
         let away = if cosine < 0.0 { -OFF } else { OFF } * self.cell;
         let at = |p: Vec3| {
             let place = self.place(p);
-            let (column, row) = (place.x.round(), place.y.round());
-            let last = (self.side - 1) as f32;
-            let inside = (0.0..=last).contains(&column) && (0.0..=last).contains(&row);
+            let (column, row) = (place.x + 0.5, place.y + 0.5);
+            let inside = column >= 0.0 && row >= 0.0 && column.max(row) < self.side as f32;
             let depths = inside.then(|| self.depths[row as usize * self.side + column as usize]);
             (place.z, depths.unwrap_or([f32::INFINITY, f32::NEG_INFINITY]))
         };

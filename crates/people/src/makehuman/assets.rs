@@ -24,7 +24,7 @@ impl Person<'_> {
         let Worn { suit, shoes, hair, hat, other } = &self.worn;
         let outfit = &self.outfit;
         if let Some(suit) = suit {
-            let mut suit = self.fit(suit).subdivide();
+            let mut suit = self.fit(suit);
             suit.patch.inflate(|vertex| 1.2 * self.folds(vertex));
             let garments = suit.garments();
             let cloth = |piece: usize| match garments.iter().position(|garment| *garment == piece) {
@@ -36,7 +36,7 @@ impl Person<'_> {
             suit.add_to(mesh, cloth);
         }
         if let Some(shoes) = shoes {
-            let shoes = self.fit(shoes).subdivide();
+            let shoes = self.fit(shoes);
             let garments = shoes.garments();
             let sole = Vec3::splat(if outfit.trim.element_sum() > 1.5 { 0.9 } else { 0.12 });
             shoes.add_to(mesh, |piece| {
@@ -44,21 +44,22 @@ impl Person<'_> {
             });
         }
         if let Some(hair) = hair {
-            self.fit(hair).subdivide().add_to(mesh, |_| Cloth::Hair(outfit.hair, outfit.seed));
+            self.fit(hair).add_to(mesh, |_| Cloth::Hair(outfit.hair, outfit.seed));
         }
         if let Some(hat) = hat {
-            self.fit(hat).subdivide().add_to(mesh, |_| Cloth::Pattern(other));
+            self.fit(hat).add_to(mesh, |_| Cloth::Pattern(other));
         }
     }
 
     /// A proxy on the posed body.
     pub fn fit(&self, proxy: &Proxy) -> Fitted {
-        proxy.fit(&self.vertices, |shares, p| {
+        let fitted = proxy.fit(&self.vertices, |shares, p| {
             let bones = shares.iter().flat_map(|(row, share)| {
                 self.library.weights[*row as usize].iter().map(move |(bone, weight)| (*bone, share * weight))
             });
             bones.map(|(bone, share)| share * self.placed[bone as usize].apply(p)).sum()
-        })
+        });
+        (0..self.detail.steps(1)).fold(fitted, |fitted, _| fitted.subdivide())
     }
 }
 

@@ -18,7 +18,7 @@ use crate::synth::surface::{self, Surface};
 const GAP: f32 = 0.004;
 /// Largest depth inside a garment, metres; deeper places count as this deep.
 const FAR: f32 = 0.08;
-/// Side of the cells that hair is meshed with, metres.
+/// Side of the cells that hair of fine people is meshed with, metres.
 const HAIR_CELL: f32 = 0.006;
 /// Largest distance in the resting pose between a point and the cloth over it, metres.
 const OVER: f32 = 0.02;
@@ -70,7 +70,7 @@ impl Person<'_> {
         let body = &self.library.groups["body"];
         let shown: Vec<[u32; 4]> =
             body.iter().copied().filter(|face| !face.iter().all(|row| self.worn.hides(*row))).collect();
-        let patch = Patch::of(&self.vertices, &shown).subdivide();
+        let patch = Patch::of(&self.vertices, &shown).subdivided(self.detail.steps(1));
         let parts = patch.vertices.iter().map(|vertex| self.rows[vertex.part()] as u8).collect();
         Piece { patch, parts }
     }
@@ -188,7 +188,7 @@ impl Person<'_> {
     /// A skirt or the tail of a coat. `under`: the pieces below it, from the inside out.
     pub fn skirt(&self, row: usize, under: &[&Piece]) -> Piece {
         let is_coat = self.body.parts[row].side == 1;
-        let mut patch = self.group("helper-skirt").subdivide().subdivide();
+        let mut patch = self.group("helper-skirt").subdivided(self.detail.steps(2));
         let off = if is_coat { 0.012 } else { 0.004 } + self.outfit.lower_thickness;
         // Close to the body at the waist.
         let loose = |vertex: &Vertex| smoothstep(0.0, 0.08, self.body.parts[row].chart(vertex.rest).1);
@@ -211,7 +211,7 @@ impl Person<'_> {
     pub fn hair(&self, skin: &Piece) -> Option<Piece> {
         let row = self.body.parts.iter().position(|part| part.kind == Kind::Hair)?;
         let hair = Body { parts: vec![self.body.parts[row].clone()] };
-        let Surface { positions, faces, .. } = surface::mesh(&hair, HAIR_CELL);
+        let Surface { positions, faces, .. } = surface::mesh(&hair, self.detail.length(HAIR_CELL));
         let head = self.placed[self.head];
         let vertex = |p: &Vec3| Vertex { rest: *p, posed: head.apply(*p), parts: [0.0; PARTS] };
         let vertices: Vec<Vertex> = positions.iter().map(vertex).collect();

@@ -19,6 +19,7 @@ use glam::Vec3;
 use snapsnap_base::FileError;
 use snapsnap_mesh::mesh::{Face, Material, Mesh, bounds};
 
+use crate::Detail;
 use crate::poses::Poses;
 use crate::synth::paint::Painter;
 use crate::synth::surface::Surface;
@@ -31,8 +32,13 @@ use person::{Person, Piece};
 ///
 /// # Errors
 /// [`FileError`] naming a file that is missing or damaged.
-pub fn person(library: &Library, name: &str, poses: Option<&Poses>) -> Result<Mesh, FileError> {
-    Ok(Person::of(library, name, poses)?.mesh())
+pub fn person(
+    library: &Library,
+    name: &str,
+    poses: Option<&Poses>,
+    detail: Detail,
+) -> Result<Mesh, FileError> {
+    Ok(Person::of(library, name, poses, detail)?.mesh())
 }
 
 impl Person<'_> {
@@ -70,7 +76,7 @@ impl Person<'_> {
         }
         let bare = [self.worn.suit.is_some(), self.worn.shoes.is_some()];
         let painter = Painter::new(&self.figure, &self.outfit, &self.face, bare);
-        let mut mesh = atlas::paint(&self.body, &surface, &painter);
+        let mut mesh = atlas::paint(&self.body, &surface, &painter, self.detail);
         mesh.positions = positions;
         self.add_worn(&mut mesh);
         self.add_eyes(&mut mesh);
@@ -83,7 +89,7 @@ impl Person<'_> {
         mesh.materials.push(Material::default());
         let material = mesh.materials.len() as u32 - 1;
         for name in ["helper-l-eye", "helper-r-eye"] {
-            let patch = self.group(name).subdivide().subdivide();
+            let patch = self.group(name).subdivided(self.detail.steps(2));
             let first = mesh.positions.len() as u32;
             let (low, high) = bounds(patch.vertices.iter().map(|vertex| vertex.rest));
             let centre = (low + high) / 2.0;

@@ -82,6 +82,11 @@ impl Patch {
         self.faces.iter().flat_map(|face| (1..face.len() - 1).map(move |i| [face[0], face[i], face[i + 1]]))
     }
 
+    /// After this number of [subdivisions](Self::subdivide).
+    pub fn subdivided(self, steps: usize) -> Self {
+        (0..steps).fold(self, |patch, _| patch.subdivide())
+    }
+
     /// One step of Catmull and Clark's subdivision; borders become smooth curves.
     pub fn subdivide(&self) -> Self {
         let count = self.vertices.len();

@@ -10,6 +10,7 @@ use super::morph::{Mix, morph};
 use super::patch::{HEAD, ORDER, PARTS, Patch, Vertex};
 use super::proxy::Worn;
 use super::rig::{self, Joints};
+use crate::Detail;
 use crate::figure::{Build, Figure, Pose};
 use crate::poses::Poses;
 use crate::skeleton::Placed;
@@ -24,6 +25,7 @@ const LARGEST: f32 = 5.0;
 /// A posed person.
 pub struct Person<'a> {
     pub library: &'a Library,
+    pub detail: Detail,
     pub figure: Figure,
     pub outfit: Outfit,
     pub marks: Marks,
@@ -58,7 +60,12 @@ pub struct Place {
 }
 
 impl<'a> Person<'a> {
-    pub fn of(library: &'a Library, name: &str, poses: Option<&Poses>) -> Result<Self, FileError> {
+    pub fn of(
+        library: &'a Library,
+        name: &str,
+        poses: Option<&Poses>,
+        detail: Detail,
+    ) -> Result<Self, FileError> {
         let mut random = stream(&format!("makehuman/{name}"));
         let mix = Mix::draw(&mut random);
         let mut build = Build::draw(&mut random);
@@ -110,9 +117,10 @@ impl<'a> Person<'a> {
         });
         Ok(Self {
             library,
+            detail,
             marks: Marks::of(&figure, &outfit),
             rows,
-            tights: group(library, &vertices, "helper-tights").subdivide().subdivide(),
+            tights: group(library, &vertices, "helper-tights").subdivided(detail.steps(2)),
             placed,
             head: joints.row("head").unwrap_or(0),
             worn,

@@ -22,7 +22,7 @@ fn library() -> Option<Library> {
 #[test]
 fn people_stand_upright_and_follow_their_names() {
     let Some(library) = library() else { return };
-    let mesh = |name: &str| person(&library, name, None).expect("made");
+    let mesh = |name: &str| person(&library, name, None, Detail::Fine).expect("made");
     let mut counts = HashSet::new();
     for index in 0..8 {
         let mesh = mesh(&format!("test/{index}"));
@@ -73,9 +73,14 @@ fn through(inner: &Patch, cloth: &Patch, inside: impl Fn(&Vertex) -> f32) -> (us
 fn nothing_comes_through_cloth() {
     let Some(library) = library() else { return };
     let mut found = [(0, 0); 2];
-    let people = (0..).map(|index| Person::of(&library, &format!("test/cloth/{index}"), None).expect("made"));
-    for person in people.filter(|person| person.worn.suit.is_none() && person.worn.shoes.is_none()).take(10) {
-        let whole = person.group("body").subdivide();
+    let people = |detail: Detail| {
+        let name = |index: usize| format!("test/cloth/{index}");
+        let person = move |index: usize| Person::of(&library, &name(index), None, detail).expect("made");
+        let own_clothes = |person: &Person| person.worn.suit.is_none() && person.worn.shoes.is_none();
+        (0..).map(person).filter(own_clothes)
+    };
+    for person in people(Detail::Fine).take(10).chain(people(Detail::Coarse).take(5)) {
+        let whole = person.group("body").subdivided(person.detail.steps(1));
         let [bottom, top] = person.layers();
         let garments = [bottom, top, person.shoes()];
         let skin = person.pressed_skin(person.skin(), &garments).patch;
@@ -104,7 +109,8 @@ fn nothing_comes_through_cloth() {
 fn suits_cover_what_is_below_them() {
     let Some(library) = library() else { return };
     let (mut out, mut all, mut suits) = (0, 0, HashSet::new());
-    let people = (0..).map(|index| Person::of(&library, &format!("test/suit/{index}"), None).expect("made"));
+    let people = (0..)
+        .map(|index| Person::of(&library, &format!("test/suit/{index}"), None, Detail::Fine).expect("made"));
     for person in people.filter(|person| person.worn.suit.is_some()).take(12) {
         let suit = person.worn.suit.as_ref().expect("is worn");
         suits.insert(std::sync::Arc::as_ptr(suit));
@@ -116,7 +122,7 @@ fn suits_cover_what_is_below_them() {
             skin.faces.len(),
             whole.faces.len()
         );
-        let suit = person.fit(suit).subdivide().patch;
+        let suit = person.fit(suit).patch;
         let hidden = |v: &Vertex| if v.parts[0] + v.parts[2] + v.parts[3] > 0.9 { 1.0 } else { 0.0 };
         let (through, under) = through(&skin, &suit, hidden);
         (out, all) = (out + through, all + under);
@@ -175,7 +181,7 @@ fn damaged_proxies_are_named() {
 fn hands_do_not_sink_into_the_body() {
     let Some(library) = library() else { return };
     for index in 0..30 {
-        let person = Person::of(&library, &format!("test/hands/{index}"), None).expect("made");
+        let person = Person::of(&library, &format!("test/hands/{index}"), None, Detail::Fine).expect("made");
         assert_eq!(rig::sunk_hands(&person.group("body"), 0.005), [false; 2], "person {index}");
     }
 }
@@ -194,7 +200,7 @@ fn missing_and_damaged_files_are_named() {
         fs::write(copy.path().join(name), bytes).expect("write");
     }
     let library = Library::open(copy.path()).expect("complete");
-    let error = person(&library, "a", None).map(drop).expect_err("no targets").to_string();
+    let error = person(&library, "a", None, Detail::Fine).map(drop).expect_err("no targets").to_string();
     assert!(error.contains("targets") && error.contains("cannot read"), "{error}");
     let damage = |name: &str, text: &str| {
         let path = copy.path().join(name);

@@ -11,9 +11,10 @@ use rayon::prelude::*;
 use super::body::Body;
 use super::paint::Painter;
 use super::surface::Surface;
+use crate::Detail;
 use snapsnap_mesh::mesh::{Face, Material, Mesh, bytes};
 
-/// Metres per texel, finer than a pixel of the sharpest views.
+/// Metres per texel of fine people, finer than a pixel of the sharpest views.
 const TEXEL: f32 = 0.0016;
 /// Radians by which charts extend beyond a full turn at each end, so that no triangle is cut.
 const OVERLAP: f32 = 0.5;
@@ -35,7 +36,7 @@ struct Chart {
 }
 
 /// The faces of `surface` as a mesh with a texture; the caller adds the positions.
-pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
+pub fn paint(body: &Body, surface: &Surface, painter: &Painter, detail: Detail) -> Mesh {
     // For each face: the part of most corners, and the positions of the corners on the part's chart.
     let charted: Vec<(usize, [(f32, f32); 3])> = surface
         .faces
@@ -60,7 +61,7 @@ pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
             (*low, *high) = (low.min(*along), high.max(*along));
         }
     }
-    let (charts, size) = pack(body, &spans);
+    let (charts, size) = pack(body, &spans, detail.length(TEXEL));
 
     let mut picture = vec![[0_u8; 3]; size[0] * size[1]];
     picture.par_chunks_mut(size[0]).enumerate().for_each(|(y, row)| {
@@ -103,8 +104,8 @@ pub fn paint(body: &Body, surface: &Surface, painter: &Painter) -> Mesh {
     mesh
 }
 
-/// Shelf packing of charts, the highest first. Also returns width and height of the picture.
-fn pack(body: &Body, spans: &[(f32, f32)]) -> (Vec<Chart>, [usize; 2]) {
+/// Shelf packing of charts of `texel` metres per texel, the highest first. Also returns width and height of the picture.
+fn pack(body: &Body, spans: &[(f32, f32)], texel: f32) -> (Vec<Chart>, [usize; 2]) {
     let mut charts: Vec<Chart> = body
         .parts
         .iter()
@@ -113,13 +114,13 @@ fn pack(body: &Body, spans: &[(f32, f32)]) -> (Vec<Chart>, [usize; 2]) {
             if low > high {
                 return Chart::default();
             }
-            let around = (2.0 * (PI + OVERLAP) * part.radius / TEXEL).ceil().max(8.0);
-            let rows = ((high - low) / TEXEL).ceil() + 2.0;
+            let around = (2.0 * (PI + OVERLAP) * part.radius / texel).ceil().max(8.0);
+            let rows = ((high - low) / texel).ceil() + 2.0;
             Chart {
                 origin: [0; 2],
                 size: [around as usize, rows as usize],
-                first: low - TEXEL,
-                step: [2.0 * (PI + OVERLAP) / around, TEXEL],
+                first: low - texel,
+                step: [2.0 * (PI + OVERLAP) / around, texel],
             }
         })
         .collect();

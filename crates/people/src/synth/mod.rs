@@ -12,6 +12,7 @@ pub(crate) mod surface;
 #[cfg(test)]
 mod tests;
 
+use crate::Detail;
 use crate::figure::{Build, Figure, Pose};
 use crate::poses::Poses;
 use body::Body;
@@ -20,15 +21,15 @@ use paint::{FACE, Painter};
 use snapsnap_base::random::stream;
 use snapsnap_mesh::mesh::Mesh;
 
-/// Side of the cells that bodies are meshed with, metres.
+/// Side of the cells that fine bodies are meshed with, metres.
 const CELL: f32 = 0.005;
 
 /// The person of this name: life-size in metres, standing on y = 0 and facing +z.
 /// Often in one of `poses`.
-pub fn person(name: &str, poses: Option<&Poses>) -> Mesh {
+pub fn person(name: &str, poses: Option<&Poses>, detail: Detail) -> Mesh {
     let (figure, outfit, body) = dressed(name, poses);
-    let surface = surface::mesh(&body, CELL);
-    let mut mesh = atlas::paint(&body, &surface, &Painter::new(&figure, &outfit, &FACE, [false; 2]));
+    let surface = surface::mesh(&body, detail.length(CELL));
+    let mut mesh = atlas::paint(&body, &surface, &Painter::new(&figure, &outfit, &FACE, [false; 2]), detail);
     mesh.positions = surface.positions;
     stand(&mut mesh);
     mesh

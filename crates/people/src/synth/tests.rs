@@ -10,7 +10,7 @@ use super::*;
 #[test]
 fn people_are_closed_and_of_one_piece() {
     for index in 0..6 {
-        let mesh = person(&format!("test/{index}"), None);
+        let mesh = person(&format!("test/{index}"), None, Detail::Fine);
         assert_eq!(mesh.check(), Ok(()));
         let mut edges: HashMap<(u32, u32), i32> = HashMap::new();
         for face in &mesh.faces {
@@ -68,7 +68,7 @@ fn hands_and_hips_stay_where_they_belong() {
 /// Triangles are about as small as the cells, which have at most 5 mm.
 #[test]
 fn triangles_are_small_and_the_texture_covers_them() {
-    let mesh = person("test/0", None);
+    let mesh = person("test/0", None, Detail::Fine);
     let longest = |f: &Face| {
         let [a, b, c] = f.positions.map(|row| mesh.positions[row as usize]);
         (b - a).length().max((c - b).length()).max((a - c).length())
@@ -84,14 +84,29 @@ fn triangles_are_small_and_the_texture_covers_them() {
     assert!(colors.len() > 500, "{} colours", colors.len());
 }
 
+/// Coarse people are the fine ones with a quarter of the triangles and texels.
+#[test]
+fn coarse_people_stand_as_fine_people_do() {
+    let [fine, coarse] = [Detail::Fine, Detail::Coarse].map(|detail| person("test/0", None, detail));
+    let ((low, high), (coarse_low, coarse_high)) = (fine.bounds(), coarse.bounds());
+    assert!((low - coarse_low).abs().max((high - coarse_high).abs()).max_element() < CELL);
+    let texels = |mesh: &Mesh| mesh.materials[0].texture.as_ref().expect("has a texture").pixels().len();
+    for (fine, coarse) in [(fine.faces.len(), coarse.faces.len()), (texels(&fine), texels(&coarse))] {
+        let ratio = fine as f64 / coarse as f64;
+        assert!((2.5..5.0).contains(&ratio), "{fine} and {coarse}");
+    }
+    assert_eq!(Detail::of_pictures(256), Detail::Coarse);
+    assert_eq!(Detail::of_pictures(257), Detail::Fine);
+}
+
 /// Recorded numbers of a person, the same on every machine.
 #[test]
 fn a_name_decides_everything() {
-    let mesh = person("train/1/0", None);
-    let again = person("train/1/0", None);
+    let mesh = person("train/1/0", None, Detail::Fine);
+    let again = person("train/1/0", None, Detail::Fine);
     assert_eq!(mesh.positions, again.positions);
     assert_eq!(mesh.faces, again.faces);
-    let other = person("val/1/0", None);
+    let other = person("val/1/0", None, Detail::Fine);
     assert_ne!(mesh.positions.len(), other.positions.len());
     let sum = mesh.positions.iter().map(|p| p.as_dvec3()).sum::<glam::DVec3>();
     let texture = mesh.materials[0].texture.as_ref().expect("has a texture");

@@ -12,7 +12,7 @@ use snapsnap_data::prepare::DataConfig;
 use snapsnap_data::sample::Stage1Item;
 use snapsnap_eval::stability::{Case, Found};
 use snapsnap_net::weights::{random_predictor, random_regressors};
-use snapsnap_people::synth;
+use snapsnap_people::{Detail, synth};
 use tempfile::TempDir;
 
 use super::config;
@@ -93,7 +93,7 @@ fn trained<T: Task>(
 fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
     let mut data = DataConfig::default();
     (data.views.count, data.views.resolution) = (4, 64);
-    let person = synth::person("stability", None);
+    let person = synth::person("stability", None, Detail::Fine);
     let lit = |factor: f32| {
         let mut mesh = person.clone();
         mesh.materials.iter_mut().for_each(|material| material.color *= factor);

@@ -12,7 +12,7 @@ use snapsnap_mesh::mesh::Mesh;
 use snapsnap_people::avatars::{Avatars, Character};
 use snapsnap_people::makehuman::{self, Library};
 use snapsnap_people::poses::Poses;
-use snapsnap_people::synth;
+use snapsnap_people::{Detail, synth};
 
 use super::{Common, Person, SPLITS, Work, make, place};
 use crate::arguments::one_of;
@@ -61,13 +61,14 @@ pub struct Generate {
 }
 
 pub fn synth(generate: &Generate) -> Result<(), Failure> {
-    generate.run("synth", &[], |name, poses| Ok(synth::person(name, poses)))
+    generate.run("synth", &[], |name, poses, detail| Ok(synth::person(name, poses, detail)))
 }
 
 pub fn makehuman(arguments: &MakehumanArguments) -> Result<(), Failure> {
     let library = Library::open(&arguments.folder)?;
-    let person = |name: &str, poses: Option<&Poses>| makehuman::person(&library, name, poses);
-    arguments.generate.run("makehuman", &[library.root()], person)
+    arguments.generate.run("makehuman", &[library.root()], |name, poses, detail| {
+        makehuman::person(&library, name, poses, detail)
+    })
 }
 
 pub fn avatars(AvatarsArguments { folder, generate }: &AvatarsArguments) -> Result<(), Failure> {
@@ -77,7 +78,7 @@ pub fn avatars(AvatarsArguments { folder, generate }: &AvatarsArguments) -> Resu
         _ => generate.split == Split::Train,
     })?;
     let animated = Cell::new(0);
-    let person = |name: &str, poses: Option<&Poses>| {
+    let person = |name: &str, poses: Option<&Poses>, _| {
         let Character { mesh, has_animations } = avatars.person(name, poses)?;
         animated.set(animated.get() + usize::from(has_animations));
         Ok(mesh)
@@ -98,12 +99,13 @@ impl Generate {
         &self,
         kind: &str,
         inputs: &[&Path],
-        person: impl Fn(&str, Option<&Poses>) -> Result<Mesh, FileError>,
+        person: impl Fn(&str, Option<&Poses>, Detail) -> Result<Mesh, FileError>,
     ) -> Result<(), Failure> {
         let Self { common, split, .. } = self;
         if self.subjects == 0 || self.subjects > MAX_SUBJECTS {
             bail!("--subjects is {}, must be 1 to {MAX_SUBJECTS}", self.subjects);
         }
+        let config = common.config()?;
         let standing = |folder: &Path| {
             let none = || FileError::unsuitable(folder, "none of its files .bvh has a standing pose");
             Poses::open(folder)?.ok_or_else(none)
@@ -126,13 +128,15 @@ impl Generate {
         };
         // A scan that exists may have been edited.
         let is_due = |work: &Work| self.save_scans && !scan(work).exists();
+        // Scans are for other programs as well.
+        let detail = if self.save_scans { Detail::Fine } else { Detail::of_pictures(config.largest_side()) };
         // Where the cameras of the data set see it.
         let placed = |work: &Work| {
-            let mut mesh = person(&work.identity, poses.as_ref())?;
+            let mut mesh = person(&work.identity, poses.as_ref(), detail)?;
             place(&mut mesh, work, Collection::Other, &common.output)?;
             Ok(mesh)
         };
-        let made = make(common, &source, &inputs, &works, |_, work| {
+        let made = make(common, &config, &source, &inputs, &works, |_, work| {
             let mesh = placed(work)?;
             if is_due(work) {
                 export::write_obj(&mesh, &scan(work))?;

@@ -121,6 +121,13 @@ struct Common {
 }
 
 impl Common {
+    fn config(&self) -> Result<DataConfig, Failure> {
+        Ok(match &self.config {
+            Some(path) => DataConfig::from_file(path, &self.set)?,
+            None => DataConfig::from_toml("", "the built-in config", &self.set)?,
+        })
+    }
+
     /// Folder of a subject's pictures.
     fn pictures(&self, split: Split, subject: &str) -> PathBuf {
         self.output.join(split.name()).join("img").join(subject)
@@ -167,15 +174,12 @@ struct Person {
 /// Makes this shard's missing subjects. A subject that cannot be made is reported and left out.
 fn make(
     common: &Common,
+    config: &DataConfig,
     source: &str,
     inputs: &[&Path],
     works: &[Work],
     person: impl Fn(usize, &Work) -> Result<Person, FileError>,
 ) -> Result<(), Failure> {
-    let config = match &common.config {
-        Some(path) => DataConfig::from_file(path, &common.set)?,
-        None => DataConfig::from_toml("", "the built-in config", &common.set)?,
-    };
     if let Some(sheet) = &common.preview {
         check_preview(sheet, common, inputs)?;
     }
@@ -185,7 +189,7 @@ fn make(
     let (path, resolved) = (common.output.join(CONFIG), config.to_toml());
     // People that are there already have the cameras of this config; `dataset.toml` does not have all of them.
     if let (true, Ok(there)) = (is_begun, DataConfig::from_file(&path, &[])) {
-        let differing = differences(&keys(&there), &keys(&config));
+        let differing = differences(&keys(&there), &keys(config));
         if !differing.is_empty() {
             let differing: Vec<String> = differing.into_iter().map(|(_, message)| message).collect();
             let message = format!(

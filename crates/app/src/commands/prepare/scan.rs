@@ -66,11 +66,12 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         let message = "none of its scans is in the split that --only names";
         return Err(FileError::unsuitable(&arguments.source, message).into());
     }
+    let config = arguments.common.config()?;
     let description = describe(arguments);
     let mut inputs = vec![arguments.source.as_path()];
     inputs.extend(arguments.smplx.as_deref());
     let unknown = Cell::new(0);
-    let made = make(&arguments.common, &description, &inputs, &works, |place, work| {
+    let made = make(&arguments.common, &config, &description, &inputs, &works, |place, work| {
         let path = &sources[place].path;
         // A test of a person who was trained on would not be fair.
         let is_in = |split: Split| arguments.common.pictures(split, &work.subject).exists();
