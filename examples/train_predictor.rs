@@ -24,7 +24,7 @@ use snapsnap_net::network::View;
 use snapsnap_net::steps::Record;
 use snapsnap_net::weights::{random_predictor, save};
 use snapsnap_net::{Prediction, Window};
-use snapsnap_people::synth;
+use snapsnap_people::{Detail, synth};
 use snapsnap_train::gradients;
 use snapsnap_train::networks::Networks;
 use snapsnap_train::optimizer::{MuonSettings, OptimizerConfig};
@@ -67,7 +67,7 @@ fn data_set(root: &Path, resolution: usize) -> Result<Arc<Folder>, FileError> {
     let people = PEOPLE.into_iter().flat_map(|(split, count)| (0..count).map(move |index| (split, index)));
     let people = people.map(|(split, index)| {
         let name = format!("{}-{index}", split.name());
-        let mesh = synth::person(&name, None);
+        let mesh = synth::person(&name, None, Detail::of_pictures(resolution as u32));
         (split, name, mesh)
     });
     config.make(root, "examples/train_predictor.rs", people)

@@ -74,8 +74,9 @@ fn nothing_comes_through_cloth() {
     let Some(library) = library() else { return };
     let mut found = [(0, 0); 2];
     let people = |detail: Detail| {
+        let library = &library;
         let name = |index: usize| format!("test/cloth/{index}");
-        let person = move |index: usize| Person::of(&library, &name(index), None, detail).expect("made");
+        let person = move |index: usize| Person::of(library, &name(index), None, detail).expect("made");
         let own_clothes = |person: &Person| person.worn.suit.is_none() && person.worn.shoes.is_none();
         (0..).map(person).filter(own_clothes)
     };
