@@ -2,29 +2,52 @@
 # Trains networks like those of the default weights: bash configs/default/train.sh MAKEHUMAN_DATA AVATARS, in the repository's root. An
 # interrupted training continues when it is started again. docs/weights.md says where the default weights' own training differed.
 set -eu
-makehuman=$1 avatars=$2
-# bodies FOLDER SPLIT SEED COUNT OPTION…: people of two makers.
-bodies() {
-  options="--split $2 --seed $3 --subjects $4 ${*:5}"
-  cargo xtask prepare makehuman "$makehuman" $options -o "people/$1/makehuman"
-  # Avatars that cannot be read are skipped, with exit code 2.
-  cargo xtask prepare avatars "$avatars" $options -o "people/$1/avatars" || [ $? = 2 ]
-}
-# people FOLDER SPLIT SEED COUNT OPTION…: people of all three makers.
+makehuman=$1 avatars=$2 maker=
+# An interrupted training writes its state and succeeds, so that the script has to end by itself.
+trap 'exit 130' INT TERM
+trap '[ -z "$maker" ] || kill -- "-$maker" 2> /dev/null || true' EXIT
+further='--set light.kind="random" --set views.second_depth=true'
+# people FOLDER SPLIT SEED SYNTH MAKEHUMAN AVATARS OPTION…: numbers of people of three makers.
 people() {
-  further='--set light.kind="random" --set views.second_depth=true'
-  cargo xtask prepare synth --split $2 --seed $3 --subjects $4 ${*:5} $further -o "people/$1/synth"
-  bodies "$@" $further
+  options="--split $2 --seed $3 ${*:7}"
+  [ $4 = 0 ] || cargo xtask prepare synth $options --subjects $4 -o "people/$1/synth"
+  cargo xtask prepare makehuman "$makehuman" $options --subjects $5 -o "people/$1/makehuman"
+  # Avatars that cannot be read are skipped, with exit code 2.
+  cargo xtask prepare avatars "$avatars" $options --subjects $6 -o "people/$1/avatars" || [ $? = 2 ]
 }
-for cameras in default phone; do
-  people $cameras train 901 500 --config configs/data/$cameras.toml
-  people $cameras val 901 24 --config configs/data/$cameras.toml
+# generation N: 600 people that no other generation has.
+generation() {
+  [ ! -e "people/$1" ] || return 0
+  people "$1.part/phone" train $((9000 + $1)) 100 160 130 --config configs/data/phone.toml $further
+  people "$1.part/default" train $((9000 + $1)) 50 90 70 --config configs/data/default.toml $further
+  mv "people/$1.part" "people/$1"
+}
+# points RUN CONFIG WEIGHTS FIRST LAST: stage 1 on these generations, 1,500 steps of 4 samples each: a person is used ten times. One
+# thread makes the next generation meanwhile. Networks memorise people whom they see more often (docs/notes/weights.md).
+points() {
+  for n in $(seq $4 $5); do
+    [ ! -e "runs/$1.$n" ] || continue
+    generation $n
+    # In a process group of its own, which ends with the script.
+    set -m
+    [ $n = $5 ] || (renice -n 15 $BASHPID > /dev/null && RAYON_NUM_THREADS=1 generation $((n + 1))) &
+    maker=$!
+    set +m
+    cargo xtask train-stage1 --config "configs/default/$2.toml" $3 --data people/$n/*/* people/val/*/* --resume --force \
+      --set training.steps=$((1500 * (n - $4 + 1))) --set schedule.fall=$([ $n = $5 ] && echo 1500 || echo 0) -o "runs/$1"
+    touch "runs/$1.$n"
+    wait
+    [ $n = $5 ] || rm -r "people/$n"
+  done
+}
+for cameras in phone default; do
+  people val/$cameras val 901 24 24 24 --config configs/data/$cameras.toml $further
 done
 # People in views of the size of photographs.
-bodies close train 904 900 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
-bodies close val 904 16 --config configs/data/phone.toml --set views.resolution=1024 --set views.count=4
-data="people/default/synth people/default/makehuman people/default/avatars people/phone/synth people/phone/makehuman people/phone/avatars"
-cargo xtask train-stage1 --config configs/default/photographs.toml --data $data --resume -o runs/default-photographs
+close="--config configs/data/phone.toml --set views.resolution=1024 --set views.count=4"
+people close train 904 0 900 900 $close
+people close val 904 0 16 16 $close
+points default-photographs photographs "" 1 16
 # The network of the sides begins with random weights.
 if [ ! -e runs/default-points ]; then
   network=(--config configs/studies/network.toml --set 'network.sides="completed"' --set network.second_layer=true)
@@ -32,9 +55,8 @@ if [ ! -e runs/default-points ]; then
   cargo xtask import-weights runs/default-photographs/best.safetensors --fill runs/default-random.safetensors "${network[@]}" \
     -o runs/default-start.safetensors
 fi
-cargo xtask train-stage1 --config configs/default/stage1.toml --data $data --weights runs/default-start.safetensors --resume \
-  -o runs/default-points
-cargo xtask train-stage2 --config configs/default/stage2.toml --data $data --weights runs/default-points/best.safetensors --resume \
+points default-points stage1 "--weights runs/default-start.safetensors" 17 24
+cargo xtask train-stage2 --config configs/default/stage2.toml --data people/24/*/* people/val/*/* --weights runs/default-points/best.safetensors --resume \
   -o runs/default-both
 # Details have random weights at first. The other layers stay as they are.
 details="--set network.details.resolution=1024"

@@ -40,7 +40,14 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
                 let message = format!("{root}: has views of {there}² pixels, network.resolution is {needed}");
                 return Err(TrainError::Unsuitable(message));
             }
-            training.push(new(folder.clone(), Some(Split::Train), samples.clone())?);
+            // Some data sets have people of the validation alone.
+            let splits = folder.splits();
+            if splits.contains(&Some(Split::Train)) || !splits.contains(&Some(Split::Val)) {
+                training.push(new(folder.clone(), Some(Split::Train), samples.clone())?);
+            }
+        }
+        if training.is_empty() {
+            return Err(TrainError::Unsuitable("no data set has people of the split train".into()));
         }
         let wanted = Some(Split::Val);
         let wished = config.training.validation_samples;

@@ -1,11 +1,13 @@
 //! The identity of a run: its settings, data and frozen predictor. A run is not continued with others.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use snapsnap_base::FileError;
 use snapsnap_base::config::{differences, keys};
+use snapsnap_data::dataset::Folder;
 use snapsnap_data::dataset::Split::{self, Train, Val};
 
 use crate::TrainError;
@@ -56,7 +58,12 @@ impl Identity {
         own.retain(|key, _| !FREE.contains(&key.as_str()));
         let folders = &task.data().folders;
         let fingerprints = |splits: &[Split]| {
-            folders.iter().map(|folder| folder.fingerprint(splits)).collect::<Result<_, FileError>>()
+            let has_any = |folder: &&Arc<Folder>| {
+                let there = folder.splits();
+                splits.iter().any(|split| there.contains(&Some(*split)))
+            };
+            let some = folders.iter().filter(has_any);
+            some.map(|folder| folder.fingerprint(splits)).collect::<Result<_, FileError>>()
         };
         let frozen = task.frozen();
         let predictor = (!frozen.is_empty()).then(|| {

@@ -7,7 +7,7 @@ use std::{fs, thread};
 use snapsnap_net::weights::Source;
 use snapsnap_tests::{copy_folder, files, fill_weights, refused, succeed, synthetic_people};
 
-use super::{people, place, results, train, train_on};
+use super::{logged, people, place, results, train, train_on};
 
 #[test]
 fn wrong_settings_weights_and_folders_are_refused_by_name() {
@@ -226,6 +226,30 @@ fn the_best_validation_is_of_the_present_people() {
     assert!(output.status.success() && err.contains("counts no longer"), "{err}");
     assert!(out.contains("after step 44"), "{out}");
     assert!(results(&run)[1] != before[1], "the former best weights");
+}
+
+/// A run goes on with one generation of people after the other. The validation's people have a data set of their own.
+#[test]
+fn the_best_validation_counts_for_later_people() {
+    let (temporary, config) = place();
+    let [run, other, held] = ["run", "other", "held"].map(|name| temporary.path().join(name));
+    let both = [("train", &other), ("val", &held)];
+    both.map(|(split, folder)| succeed(&mut synthetic_people(folder, split, 1, 4)));
+    let generation = |people: &Path, steps: &str| {
+        let mut command = train_on(people, 1, &config, &run);
+        command.arg("--data").arg(&held).args(["--resume", "--force", steps]);
+        command
+    };
+    let training_alone = temporary.path().join("first");
+    copy_folder(people(), &training_alone);
+    fs::remove_dir_all(training_alone.join("val")).expect("removes");
+    succeed(&mut generation(&training_alone, "--set=training.steps=4"));
+    let output = generation(&other, "--set=training.steps=6").output().expect("runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && !said.contains("counts no longer"), "{said}");
+    assert_eq!(logged(&run, "validation/points_mm").last().expect("a validation").0, 6);
+    let said = refused(&mut train_on(&held, 1, &config, &temporary.path().join("none")));
+    assert!(said.contains("no data set has people of the split train"), "{said}");
 }
 
 #[test]
