@@ -233,8 +233,9 @@ fn the_best_validation_is_of_the_present_people() {
 fn the_best_validation_counts_for_later_people() {
     let (temporary, config) = place();
     let [run, other, held] = ["run", "other", "held"].map(|name| temporary.path().join(name));
-    let both = [("train", &other), ("val", &held)];
-    both.map(|(split, folder)| succeed(&mut synthetic_people(folder, split, 1, 4)));
+    for (split, folder) in [("train", &other), ("val", &held)] {
+        succeed(&mut synthetic_people(folder, split, 1, 4));
+    }
     let generation = |people: &Path, steps: &str| {
         let mut command = train_on(people, 1, &config, &run);
         command.arg("--data").arg(&held).args(["--resume", "--force", steps]);
