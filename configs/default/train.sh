@@ -3,6 +3,8 @@
 # interrupted training continues when it is started again. docs/weights.md says where the default weights' own training differed.
 set -eu
 makehuman=$1 avatars=$2 maker=
+# The last generation of the first part. The second part has half as many.
+last=${GENERATIONS:-16}
 # An interrupted training writes its state and succeeds, so that the script has to end by itself.
 trap 'exit 130' INT TERM
 trap '[ -z "$maker" ] || kill -- "-$maker" 2> /dev/null || true' EXIT
@@ -17,15 +19,14 @@ people() {
 }
 # generation N: 600 people that no other generation has.
 generation() {
-  [ ! -e "people/$1" ] || return 0
-  people "$1.part/phone" train $((9000 + $1)) 100 160 130 --config configs/data/phone.toml $further
-  people "$1.part/default" train $((9000 + $1)) 50 90 70 --config configs/data/default.toml $further
-  mv "people/$1.part" "people/$1"
+  people "$1/phone" train $((9000 + $1)) 100 160 130 --config configs/data/phone.toml $further
+  people "$1/default" train $((9000 + $1)) 50 90 70 --config configs/data/default.toml $further
 }
+data() { echo people/$1/{phone,default}/{synth,makehuman,avatars}; }
 # points RUN CONFIG WEIGHTS FIRST LAST: stage 1 on these generations, 1,500 steps of 4 samples each: a person is used ten times. One
 # thread makes the next generation meanwhile. Networks memorise people whom they see more often (docs/notes/weights.md).
 points() {
-  for n in $(seq $4 $5); do
+  for ((n = $4; n <= $5; n++)); do
     [ ! -e "runs/$1.$n" ] || continue
     generation $n
     # In a process group of its own, which ends with the script.
@@ -33,7 +34,7 @@ points() {
     [ $n = $5 ] || (renice -n 15 $BASHPID > /dev/null && RAYON_NUM_THREADS=1 generation $((n + 1))) &
     maker=$!
     set +m
-    cargo xtask train-stage1 --config "configs/default/$2.toml" $3 --data people/$n/*/* people/val/*/* --resume --force \
+    cargo xtask train-stage1 --config "configs/default/$2.toml" $3 --data $(data $n) $(data val) --resume --force \
       --set training.steps=$((1500 * (n - $4 + 1))) --set schedule.fall=$([ $n = $5 ] && echo 1500 || echo 0) -o "runs/$1"
     touch "runs/$1.$n"
     wait
@@ -47,7 +48,7 @@ done
 close="--config configs/data/phone.toml --set views.resolution=1024 --set views.count=4"
 people close train 904 0 900 900 $close
 people close val 904 0 16 16 $close
-points default-photographs photographs "" 1 16
+points default-photographs photographs "" 1 $last
 # The network of the sides begins with random weights.
 if [ ! -e runs/default-points ]; then
   network=(--config configs/studies/network.toml --set 'network.sides="completed"' --set network.second_layer=true)
@@ -55,9 +56,9 @@ if [ ! -e runs/default-points ]; then
   cargo xtask import-weights runs/default-photographs/best.safetensors --fill runs/default-random.safetensors "${network[@]}" \
     -o runs/default-start.safetensors
 fi
-points default-points stage1 "--weights runs/default-start.safetensors" 17 24
-cargo xtask train-stage2 --config configs/default/stage2.toml --data people/24/*/* people/val/*/* --weights runs/default-points/best.safetensors --resume \
-  -o runs/default-both
+points default-points stage1 "--weights runs/default-start.safetensors" $((last + 1)) $((last + (last + 1) / 2))
+cargo xtask train-stage2 --config configs/default/stage2.toml --data $(data $((last + (last + 1) / 2))) $(data val) \
+  --weights runs/default-points/best.safetensors --resume -o runs/default-both
 # Details have random weights at first. The other layers stay as they are.
 details="--set network.details.resolution=1024"
 if [ ! -e runs/default-details ]; then

@@ -34,6 +34,7 @@ const TASKS: [&str; 6] = ["test", "lint", "dist", "fuzz", "bundle", "help"];
 const RECORDER: &str = r#"set -eu
 record() { { printf '%s\037' "$@"; printf '\036'; } >> "$COMMANDS"; }
 for program in cargo snapsnap python bash; do eval "$program() { record $program \"\$@\"; }"; done
+touch() { :; }
 "#;
 
 type Words = Vec<String>;
@@ -57,8 +58,8 @@ fn recorded(page: &str, script: &str, arguments: &[String]) -> Vec<Words> {
     fs::write(&commands, "").expect("written");
     let mut shell = Command::new("/bin/bash");
     shell.args(["-c", &format!("{RECORDER}{script}"), page]).args(arguments).env("COMMANDS", &commands);
-    // Only some rows of the sweeps, since all rows are alike.
-    shell.env("ROWS", "base transformer regressor free-start all");
+    // Only some rows of the sweeps and one generation of people, since all are alike.
+    shell.env("ROWS", "base transformer regressor free-start all").env("GENERATIONS", "1");
     // Nothing but what is recorded may be started.
     let output = shell.env("PATH", "/nowhere").current_dir(temporary.path()).output().expect("bash starts");
     assert!(output.status.success(), "{page}: {script}\n{}", String::from_utf8_lossy(&output.stderr));
