@@ -102,6 +102,21 @@ fn ndarray() -> Device {
     Device::ndarray()
 }
 
+/// Builds a part of the workspace with the features of the tests' own build and with `features`. Returns the folder
+/// of the built files.
+pub fn build(part: &[&str], features: &str) -> PathBuf {
+    let test = std::env::current_exe().expect("the test's own path");
+    let release = test.ancestors().nth(2).expect("target/release/deps/test");
+    let target = release.parent().expect("target/release");
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let mut build = Command::new(cargo);
+    build.args(["build", "--quiet", "--release"]).args(part).arg("--target-dir").arg(target);
+    let own = std::env::var("SNAPSNAP_FEATURES").unwrap_or_default();
+    build.args(["--features", &format!("{own},{features}")]).current_dir(root());
+    assert!(build.status().expect("cargo starts").success(), "{part:?} builds");
+    release.to_owned()
+}
+
 /// The program as a user starts it. It is built first, unless `SNAPSNAP_PROGRAM` is the path of a program.
 pub fn snapsnap() -> Command {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
@@ -109,18 +124,7 @@ pub fn snapsnap() -> Command {
         if let Some(program) = std::env::var_os("SNAPSNAP_PROGRAM") {
             return program.into();
         }
-        let test = std::env::current_exe().expect("the test's own path");
-        let release = test.ancestors().nth(2).expect("target/release/deps/test");
-        let target = release.parent().expect("target/release");
-        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        let mut build = Command::new(cargo);
-        build.args(["build", "--quiet", "--release", "--package", "snapsnap", "--bin", "snapsnap"]);
-        build.arg("--target-dir").arg(target);
-        // The features of the tests' own build.
-        if let Some(features) = std::env::var_os("SNAPSNAP_FEATURES") {
-            build.arg("--features").arg(features);
-        }
-        assert!(build.status().expect("cargo starts").success(), "the program builds");
+        let release = build(&["--package", "snapsnap", "--bin", "snapsnap"], "");
         release.join("snapsnap").with_extension(std::env::consts::EXE_EXTENSION)
     });
     let mut command = Command::new(program);

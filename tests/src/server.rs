@@ -3,7 +3,7 @@
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStderr, Command, Stdio};
 
 use crate::snapsnap;
 
@@ -25,7 +25,7 @@ impl Server {
     /// Serves a file of Gaussians on a free port.
     pub fn new(file: &Path) -> Self {
         let mut command = snapsnap();
-        command.arg("view").arg(file);
+        command.arg("view").arg(file).stderr(Stdio::null());
         Self::started(command)
     }
 
@@ -33,11 +33,22 @@ impl Server {
     pub fn studio(resolution: u32) -> Self {
         let mut command = snapsnap();
         command.args(["studio", "--device", "cpu", "--set", &format!("network.resolution={resolution}")]);
+        command.stderr(Stdio::null());
         Self::started(command)
     }
 
+    /// A studio for the local network, and what it says before the first address for a device.
+    pub fn studio_in_lan(resolution: u32) -> (Self, BufReader<ChildStderr>) {
+        let mut command = snapsnap();
+        command.args(["studio", "--lan", "--device", "cpu", "--set"]);
+        command.arg(format!("network.resolution={resolution}")).stderr(Stdio::piped());
+        let mut server = Self::started(command);
+        let said = server.process.stderr.take().expect("piped");
+        (server, BufReader::new(said))
+    }
+
     fn started(mut command: Command) -> Self {
-        command.stdout(Stdio::piped()).stderr(Stdio::null());
+        command.stdout(Stdio::piped());
         let mut process = command.spawn().expect("started");
         let mut line = String::new();
         BufReader::new(process.stdout.take().expect("piped")).read_line(&mut line).expect("an address");
@@ -80,7 +91,12 @@ impl Server {
     }
 
     fn answer(&self, request: &[u8]) -> (u16, String, Vec<u8>) {
-        let mut stream = TcpStream::connect(("127.0.0.1", self.port)).expect("connected");
+        self.answer_at("127.0.0.1", request)
+    }
+
+    /// The answer to a request's bytes at an address of this machine.
+    pub fn answer_at(&self, address: &str, request: &[u8]) -> (u16, String, Vec<u8>) {
+        let mut stream = TcpStream::connect((address, self.port)).expect("connected");
         // The server may close the connection before it has read a refused body.
         let _ = stream.write_all(request);
         let mut answer = Vec::new();

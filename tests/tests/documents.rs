@@ -179,14 +179,7 @@ fn less(words: &[String]) -> Words {
             }
         }
         "evaluate" => {
-            let keys = [
-                "data.subjects=1",
-                "report.people=1",
-                "views.compared=[1]",
-                "views.turns=[0]",
-                "views.resolution=0",
-            ];
-            for key in keys {
+            for key in ["data.subjects=1", "report.people=1", "views.compared=[1]", "views.resolution=0"] {
                 more.extend(["--set", key]);
             }
             if !words.iter().any(|word| word == "--weights") {

@@ -1,7 +1,7 @@
 //! `snapsnap studio`: requests of its page and of other clients, and the page in a browser.
 
 use std::fs;
-use std::io::{Cursor, Read, Write};
+use std::io::{BufRead, Cursor, Read, Write};
 use std::net::{Shutdown, TcpStream};
 use std::path::Path;
 use std::thread;
@@ -107,6 +107,57 @@ fn people_of_the_studio_are_those_of_reconstruct() {
     assert_eq!(server.ask(&format!("GET /people/{headless}/scene.ply"), None).0, 200);
 }
 
+/// Each address for a device of the local network is good for one. Nobody else gets anything.
+#[test]
+fn devices_of_the_local_network_join_by_an_address() {
+    let (server, mut said) = Server::studio_in_lan(SIDE);
+    // The address of the next device, or what the program says instead.
+    let mut invited = || {
+        let mut line = String::new();
+        while !line.starts_with("http://") {
+            line.clear();
+            assert!(said.read_line(&mut line).expect("text") > 0, "the program ended");
+        }
+        let host = line.trim().strip_prefix("http://").expect("an address");
+        let (host, path) = host.split_once('/').expect("a path");
+        (host.to_owned(), format!("/{path}"))
+    };
+    let (host, path) = invited();
+    let address = host.split(':').next().expect("an address").to_owned();
+    let ask = |path: &str, host: &str, headers: &str| {
+        server.answer_at(&address, format!("GET {path} HTTP/1.1\r\nHost: {host}\r\n{headers}\r\n").as_bytes())
+    };
+    assert_eq!(ask("/", &host, "").0, 403, "a device that has not joined");
+    assert_eq!(ask("/join/0123", &host, "").0, 403, "another key");
+    let near = format!("127.0.0.1:{}", server.port);
+    assert_eq!(ask("/", &near, "").0, 403, "another device that names this machine");
+    assert_eq!(ask(&path, "evil.example", "").0, 403, "another name of this machine");
+
+    let (status, headers, _) = ask(&path, &host, "");
+    let cookie = headers.lines().find_map(|line| line.strip_prefix("set-cookie: ")).expect("a cookie");
+    assert!(status == 303 && headers.contains("location: /") && cookie.contains("httponly"), "{headers}");
+    let cookie = format!("Cookie: a=b; {}\r\n", cookie.split(';').next().expect("a value"));
+    let (status, _, page) = ask("/", &host, &cookie);
+    let page = String::from_utf8(page).expect("text");
+    assert!(status == 200 && page.contains("class=\"studio\""), "{page}");
+    assert_eq!(ask("/", &host, "Cookie: snapsnap=0\r\n").0, 403, "another cookie");
+    assert_eq!(ask("/", &host, &format!("{cookie}Origin: http://evil.example\r\n")).0, 200, "the page itself");
+    let foreign = format!("{cookie}Origin: http://evil.example\r\n");
+    assert_eq!(ask("/progress", &host, &foreign).0, 403, "a page of another site");
+    assert_eq!(ask("/invitation", &host, &cookie).0, 404, "guests invite nobody");
+
+    assert_eq!(ask(&path, &host, "").0, 403, "the address was for one device");
+    let (_, next) = invited();
+    assert_ne!(next, path);
+    let (status, _, invitation) = server.ask("GET /invitation", None);
+    let invitation: Value = serde_json::from_slice(&invitation).expect("JSON");
+    assert!(status == 200 && invitation["address"] == format!("http://{host}{next}"), "{invitation}");
+    assert!(invitation["picture"].as_str().is_some_and(|picture| picture.contains("<svg")), "{invitation}");
+    let page = String::from_utf8(server.ask("GET /", None).2).expect("text");
+    assert!(page.contains("class=\"studio inviting\""), "{page}");
+    assert_eq!(ask(&next, &host, "").0, 303, "a second device");
+}
+
 #[test]
 fn unsuitable_requests_are_refused_and_others_served() {
     let server = Server::studio(SIDE);
@@ -146,6 +197,15 @@ fn unsuitable_requests_are_refused_and_others_served() {
         "X-Parts: 99999999999999999999,0,0,0\r\n",
     ] {
         assert_eq!(refused("/reconstruct", wrong, &body).0, 400, "{wrong}");
+    }
+    let told = |fields: &str| refused("/reconstruct", &format!("{header}X-Told: {fields}\r\n"), &body);
+    for (fields, expected) in [
+        ("{\"height\":\"20\"}", "height 20: must be from 0.1 to 10"),
+        ("{\"focal\":\"long\"}", "focal long: is no number"),
+        ("{", "the page's fields"),
+    ] {
+        let (status, message) = told(fields);
+        assert!(status == 422 && message.contains(expected), "{fields}: {message}");
     }
     let (with_text, wrong) = parts(&[&front, &back, b"strokes", &[]]);
     let (status, message) = refused("/reconstruct", &with_text, &wrong);

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 /// Crates, lowest layer first, and the crates of the workspace that each may depend on.
-const LAYERS: [(&str, &[&str]); 11] = [
+const LAYERS: [(&str, &[&str]); 12] = [
     ("base", &[]),
     ("splat", &["base"]),
     ("ops", &["base"]),
@@ -17,6 +17,7 @@ const LAYERS: [(&str, &[&str]); 11] = [
     ("eval", &["data", "photo", "net", "ops", "mesh", "splat", "base"]),
     ("train", &["eval", "data", "people", "net", "ops", "mesh", "splat", "base"]),
     ("app", &["train", "eval", "data", "photo", "people", "net", "ops", "mesh", "splat", "base"]),
+    ("python", &["app", "photo", "net", "ops", "mesh", "splat"]),
 ];
 
 /// Dependencies within the workspace, of tests too, by the manifest of each folder below `crates`.
@@ -25,6 +26,7 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
     let folders = fs::read_dir(crates).expect("the crates").map(|entry| entry.expect("an entry").path());
     let ours = |line: &str| {
         let name: String = line.chars().take_while(|c| c.is_alphanumeric() || *c == '-').collect();
+        let name = if name == "snapsnap" { "snapsnap-app" } else { &name };
         name.strip_prefix("snapsnap-").map(str::to_owned)
     };
     folders

@@ -52,11 +52,11 @@ fn main() -> ExitCode {
     if done { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// The feature for MPI, if this machine can build it: that takes `mpicc` and libclang.
+/// The program's feature for MPI, if this machine can build it: that takes `mpicc` and libclang.
 fn features() -> Option<&'static str> {
     let mpicc = Command::new("mpicc").arg("-show").output().is_ok_and(|output| output.status.success());
     let missing = match (mpicc, has_libclang()) {
-        (true, true) => return Some("mpi"),
+        (true, true) => return Some("snapsnap/mpi"),
         (false, _) => "mpicc",
         (_, false) => "libclang",
     };
@@ -87,7 +87,7 @@ fn has_libclang() -> bool {
 fn test(filter: &[String]) -> bool {
     let mut all = vec!["test", "--release", "--workspace", "--no-fail-fast"];
     let features = features();
-    all.extend(features.map(|_| "--features=snapsnap/mpi"));
+    all.extend(features.into_iter().flat_map(|features| ["--features", features]));
     let numerical = ["--test", "numerical"];
     let filter = || ["--"].into_iter().chain(filter.iter().map(String::as_str));
     // Output is shown so that skipped tests are seen with their reasons.
@@ -112,7 +112,8 @@ fn test(filter: &[String]) -> bool {
 
 fn lint() -> bool {
     let mut clippy = vec!["clippy", "--release", "--workspace", "--all-targets"];
-    clippy.extend(features().map(|_| "--features=snapsnap/mpi"));
+    let features = ["snapsnap-python/python"].into_iter().chain(features()).collect::<Vec<_>>().join(",");
+    clippy.extend(["--features", &features]);
     clippy.extend(["--", "-D", "warnings"]);
     let doc = ["doc", "--release", "--workspace", "--no-deps", "--document-private-items"];
     succeeds("format", &mut cargo(&["fmt", "--all", "--check"]))

@@ -1,5 +1,6 @@
 //! `--device`: the devices of this build and this machine, and their names.
 
+use std::ffi::OsString;
 use std::panic;
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
@@ -136,15 +137,26 @@ pub fn probe() -> String {
     serde_json::to_string(&drivers).expect("plain text and numbers")
 }
 
+/// What starts this program: its path, and perhaps arguments before a command.
+static PROGRAM: OnceLock<Vec<OsString>> = OnceLock::new();
+
+/// Sets what starts this program. Until then there are no graphics adapters.
+pub fn set_program(program: &[OsString]) {
+    PROGRAM.get_or_init(|| program.to_vec());
+}
+
 /// The graphics drivers, asked by another process: they may crash, for example when memory is short, and their loaders
 /// print warnings.
 fn drivers() -> &'static Drivers {
     static DRIVERS: OnceLock<Drivers> = OnceLock::new();
     DRIVERS.get_or_init(|| {
-        let probed = std::env::current_exe().and_then(|program| {
-            Command::new(program).arg(PROBE).stdin(Stdio::null()).stderr(Stdio::null()).output()
+        let (program, arguments) = PROGRAM.get().and_then(|program| program.split_first()).unzip();
+        let probed = program.and_then(|program| {
+            let mut command = Command::new(program);
+            command.args(arguments.unwrap_or_default()).arg(PROBE).stdin(Stdio::null());
+            command.stderr(Stdio::null()).output().ok()
         });
-        let probed = probed.ok().filter(|output| output.status.success());
+        let probed = probed.filter(|output| output.status.success());
         probed.and_then(|output| serde_json::from_slice(&output.stdout).ok()).unwrap_or_default()
     })
 }

@@ -18,13 +18,16 @@ use crate::turntable;
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Download {
     Gaussians(Kind),
+    /// A PLY with y down.
+    YDown,
     Mesh,
     Turntable,
 }
 
 /// Paths of the files behind `scene.`, which are also their extensions.
-const FILES: [(&str, Download); 6] = [
+const FILES: [(&str, Download); 7] = [
     ("ply", Download::Gaussians(Kind::Ply)),
+    ("y-down.ply", Download::YDown),
     ("spz", Download::Gaussians(Kind::Spz)),
     ("sog", Download::Gaussians(Kind::Sog)),
     ("gaussians.glb", Download::Gaussians(Kind::Glb)),
@@ -48,6 +51,7 @@ impl Download {
     pub fn make(self, stored: &Stored, step: &dyn Fn(&str)) -> Result<Vec<u8>, Failure> {
         match self {
             Self::Gaussians(kind) => Ok(stored.to_bytes(kind)?),
+            Self::YDown => Ok(stored.to_bytes_y_down()?),
             Self::Mesh => {
                 let fused = fuse(&stored.load(&Device::flex()), mesh::options(MeshKind::Glb), step)?;
                 export::glb_bytes(&fused.mesh).map_err(|e| Failure::Internal(e.to_string()))

@@ -1,5 +1,6 @@
 //! Options of the commands that make people: networks, cameras and the person. The memory that a photograph needs.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
@@ -30,7 +31,7 @@ pub struct ModelArguments {
     #[arg(long, value_name = "FILE|DIR")]
     weights: Option<PathBuf>,
     #[command(flatten)]
-    pub config: ConfigArguments,
+    pub(crate) config: ConfigArguments,
     /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal; wgpu:1 is the second adapter.
     #[arg(long, default_value = "auto")]
     device: String,
@@ -41,6 +42,11 @@ pub struct ModelArguments {
 }
 
 impl ModelArguments {
+    /// These weights on this device.
+    pub fn new(weights: Option<PathBuf>, device: &str) -> Self {
+        Self { weights, config: ConfigArguments::default(), device: device.to_owned(), precision: None }
+    }
+
     /// Opens the weights of both networks.
     pub fn open(&self) -> Result<WeightFile, Failure> {
         let weights = weights::open(self.weights.as_deref(), &self.config)?;
@@ -86,23 +92,39 @@ impl ModelArguments {
 }
 
 /// Options about the cameras and the person.
-#[derive(Args, Debug, Default)]
+#[derive(Args, Debug, Clone, Copy, Default)]
 pub struct CameraArguments {
     /// Height of the person in metres [default: 1.72].
     #[arg(long, value_name = "METRES")]
-    height: Option<f64>,
+    pub height: Option<f64>,
     /// Focal length of both photographs in millimetres of 35 mm film [default: the files' own, else unknown].
     #[arg(long, value_name = "MM", conflicts_with = "distance")]
-    focal: Option<f64>,
+    pub focal: Option<f64>,
     /// Distance of both cameras in metres [default: it follows from the focal length, else 2].
     #[arg(long, value_name = "METRES")]
-    distance: Option<f64>,
+    pub distance: Option<f64>,
     /// How far both cameras look down at the person's middle, in degrees [default: what an iPhone's files say, else 8].
     #[arg(long, value_name = "DEGREES", allow_hyphen_values = true)]
-    elevation: Option<f64>,
+    pub elevation: Option<f64>,
 }
 
 impl CameraArguments {
+    /// These options, replaced by a page's fields: JSON of names and texts.
+    pub fn updated(self, fields: &str) -> Result<Self, Failure> {
+        let parsed: HashMap<String, String> = serde_json::from_str(fields)
+            .map_err(|e| Failure::Input(format!("the page's fields: {e}")))?;
+        let mut updated = self;
+        for (name, text) in parsed {
+            let field = match name.as_str() {
+                "height" => &mut updated.height,
+                "focal" => &mut updated.focal,
+                _ => continue,
+            };
+            *field = Some(text.parse().map_err(|_| Failure::Input(format!("{name} {text}: is no number")))?);
+        }
+        Ok(updated)
+    }
+
     /// Refuses impossible values, and all values if the config's networks do not place photographs as a user's.
     pub fn told(&self, config: &Config, as_is: bool) -> Result<Told, Failure> {
         let Self { height, focal, distance, elevation } = *self;

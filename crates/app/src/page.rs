@@ -5,20 +5,26 @@ use std::io;
 use std::net::{Ipv4Addr, TcpListener};
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 
+use base64::prelude::{BASE64_STANDARD, Engine};
 use clap::Args;
 use http::StatusCode;
 use snapsnap_base::FileError;
 
 use crate::failure::Failure;
+use crate::guests::Guests;
 use crate::server::{Answer, Body, Content, Refusal, Request, serve};
 use crate::{interrupt, say};
 
 /// Options of a page.
 #[derive(Args)]
 pub struct PageArguments {
-    /// Port on 127.0.0.1 [default: a free one].
+    /// Port [default: a free one].
     #[arg(long)]
     port: Option<u16>,
+    /// Also serve the local network: a QR code leads a telephone to the page. Each address is good for one device.
+    /// Nothing is encrypted.
+    #[arg(long)]
+    lan: bool,
     /// Start the browser.
     #[arg(long)]
     open: bool,
@@ -40,6 +46,23 @@ const FILES: [PageFile; 3] = [
 const INDEX: &str = include_str!("../viewer/index.html");
 /// The part of [`INDEX`] that tells the page's script which command serves it.
 const VIEW: &str = "<html lang=\"en\" class=\"view\">";
+/// The parts of [`INDEX`] that lead to its script and its style.
+const SCRIPT: &str = "<script type=\"module\" src=\"./viewer.js\"></script>";
+const STYLE: &str = "<link rel=\"stylesheet\" href=\"./viewer.css\" />";
+
+/// One HTML file that shows an SPZ without a server.
+pub fn alone(name: &str, spz: &[u8]) -> String {
+    let [script, style] = [FILES[0].2, FILES[1].2].map(String::from_utf8_lossy);
+    // A script ends at this tag, also within a text of its own.
+    let script = script.replace("</script", "<\\/script");
+    let name = name.replace('&', "&amp;").replace('"', "&quot;").replace('<', "&lt;");
+    let scene = BASE64_STANDARD.encode(spz);
+    let scene = format!("<script id=\"scene\" type=\"text/plain\" data-name=\"{name}\">{scene}</script>");
+    let page = INDEX
+        .replace(SCRIPT, &format!("<script type=\"module\">{script}</script>"))
+        .replace(STYLE, &format!("<style>{style}</style>"));
+    page.replace("</body>", &format!("{scene}</body>"))
+}
 
 /// Serves the page of a command, `view` or `studio`, until the program ends. `shows` is its content in words; `rest`
 /// answers requests for other paths, or refuses them with an answer.
@@ -50,40 +73,67 @@ pub fn show(
     rest: &(dyn Fn(&Request, &mut Body) -> Result<Answer, Answer> + Sync),
 ) -> Result<(), Failure> {
     let wanted = arguments.port.unwrap_or(0);
-    let cannot = |e: io::Error| Failure::Input(format!("--port {wanted}: cannot listen on 127.0.0.1: {e}"));
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, wanted)).map_err(cannot)?;
+    let own = if arguments.lan { Ipv4Addr::UNSPECIFIED } else { Ipv4Addr::LOCALHOST };
+    let cannot = |e: io::Error| Failure::Input(format!("--port {wanted}: cannot listen on {own}: {e}"));
+    let listener = TcpListener::bind((own, wanted)).map_err(cannot)?;
     let port = listener.local_addr().map_err(cannot)?.port();
+    let guests = arguments.lan.then(|| Guests::new(port)).transpose()?;
     let url = format!("http://127.0.0.1:{port}/");
     interrupt::end_well();
     // The address is printed with --quiet as well.
     say::out(&url);
     say::note(&format!("{shows}; Ctrl-C ends it"));
+    guests.iter().for_each(Guests::invite);
     if arguments.open
         && let Err(e) = open::that_detached(&url)
     {
         say::err(&format!("warning: --open: no browser could be started ({e}); open {url} by hand"));
     }
     serve(&listener, &|request, body| {
-        let answer = refused(request, port).or_else(|| file(command, request));
+        let answer = refused(request, port, guests.as_ref()).or_else(|| {
+            let guests = guests.as_ref().filter(|_| request.is_near);
+            match guests.filter(|_| request.path == "/invitation" && is_read(request)) {
+                Some(guests) => Some(guests.invitation()),
+                None => file(&class(command, guests.is_some()), request),
+            }
+        });
         answer.unwrap_or_else(|| rest(request, body).unwrap_or_else(|refused| refused))
     })
 }
 
-/// Refuses requests of anybody but this server's own page.
-fn refused(request: &Request, port: u16) -> Option<Answer> {
-    // Other names may belong to a page of another host whose name resolves to 127.0.0.1.
-    let is_local = |host: &String| {
+/// Classes of the page for a command, on a machine whose page invites other devices.
+fn class(command: &str, is_inviting: bool) -> String {
+    format!("{command}{}", if is_inviting { " inviting" } else { "" })
+}
+
+/// Refuses requests of anybody but this server's own page, on this machine or on a device that has joined, and lets
+/// devices join.
+fn refused(request: &Request, port: u16, guests: Option<&Guests>) -> Option<Answer> {
+    // Other names may belong to a page of another host whose name resolves to this machine.
+    let is_own = |host: &str| {
         let host = host.to_ascii_lowercase();
         // Browsers omit port 80.
         let name = host.strip_suffix(&format!(":{port}")).or((port == 80).then_some(host.as_str()));
-        name.is_some_and(|name| ["127.0.0.1", "localhost"].contains(&name))
+        name.is_some_and(|name| match guests {
+            Some(guests) if guests.is_host(name) => true,
+            _ => request.is_near && ["127.0.0.1", "localhost"].contains(&name),
+        })
     };
-    if !request.host.as_ref().is_some_and(is_local) {
+    if !request.host.as_deref().is_some_and(is_own) {
         return Some(text(StatusCode::FORBIDDEN, "only for http://127.0.0.1"));
     }
+    if let Some(guests) = guests.filter(|_| !request.is_near) {
+        let joined = guests.joined(request);
+        if joined.is_some() {
+            return joined;
+        }
+        if !guests.knows(request) {
+            let message = "open the address that the program and its page on the computer show";
+            return Some(text(StatusCode::FORBIDDEN, message));
+        }
+    }
     // A page of another site may lead here, but may not start any work.
-    let is_own_origin =
-        |origin: &String| origin.strip_prefix("http://").is_some_and(|host| is_local(&host.to_owned()));
+    let is_own_origin = |origin: &String| origin.strip_prefix("http://").is_some_and(is_own);
     let is_own_page = request.origin.as_ref().is_none_or(is_own_origin)
         && request.fetch_site.as_deref().is_none_or(|site| ["same-origin", "none"].contains(&site));
     (!is_own_page && request.path != "/")

@@ -20,7 +20,6 @@ const FILES: &[&str] = &[
     "people.png",
     "by_view.svg",
     "views.csv",
-    "subjects.csv",
     "settings.csv",
     "pareto.svg",
     "training_points.svg",

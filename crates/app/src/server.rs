@@ -1,4 +1,4 @@
-//! A small web server for local clients, with one request per connection. The time of a connection and the memory of
+//! A small web server for a few clients, with one request per connection. The time of a connection and the memory of
 //! all uploads are bounded. All connections share one copy of a file.
 
 use std::io::{self, Read, Write};
@@ -37,8 +37,12 @@ static HELD: AtomicU64 = AtomicU64::new(0);
 pub struct Request {
     /// The path, without query and fragment.
     pub path: String,
+    /// Whether it comes from this machine.
+    pub is_near: bool,
     /// The `Host` header.
     pub host: Option<String>,
+    /// The `Cookie` header.
+    pub cookie: Option<String>,
     /// The method, for example GET.
     pub method: String,
     /// The `Origin` header.
@@ -49,6 +53,8 @@ pub struct Request {
     pub job: Option<String>,
     /// The `X-Parts` header: lengths of the body's parts.
     pub parts: Option<String>,
+    /// The `X-Told` header: what the user says of the photographs, as JSON.
+    pub told: Option<String>,
     /// Length of the body.
     length: Option<u64>,
 }
@@ -248,7 +254,8 @@ fn request(stream: &mut TcpStream) -> io::Result<Result<(Request, Vec<u8>), Refu
         let mut parsed = httparse::Request::new(&mut headers);
         match parsed.parse(&bytes) {
             Ok(httparse::Status::Complete(head)) => {
-                return Ok(checked(&parsed).map(|request| (request, bytes[head..].to_vec())));
+                let is_near = stream.peer_addr()?.ip().to_canonical().is_loopback();
+                return Ok(checked(&parsed, is_near).map(|request| (request, bytes[head..].to_vec())));
             }
             Ok(httparse::Status::Partial) if bytes.len() < LONGEST => {}
             Ok(httparse::Status::Partial) | Err(httparse::Error::TooManyHeaders) => {
@@ -259,7 +266,7 @@ fn request(stream: &mut TcpStream) -> io::Result<Result<(Request, Vec<u8>), Refu
     }
 }
 
-fn checked(parsed: &httparse::Request) -> Result<Request, Refusal> {
+fn checked(parsed: &httparse::Request, is_near: bool) -> Result<Request, Refusal> {
     let named = |name: &'static str| {
         let found = parsed.headers.iter().filter(move |header| header.name.eq_ignore_ascii_case(name));
         found.map(|header| String::from_utf8_lossy(header.value).into_owned())
@@ -276,12 +283,15 @@ fn checked(parsed: &httparse::Request) -> Result<Request, Refusal> {
     let length = header("content-length").and_then(|length| length.trim().parse().ok());
     Ok(Request {
         path,
+        is_near,
         host: header("host"),
+        cookie: header("cookie"),
         method: parsed.method.unwrap_or_default().to_owned(),
         origin: header("origin"),
         fetch_site: header("sec-fetch-site"),
         job: header("x-job"),
         parts: header("x-parts"),
+        told: header("x-told"),
         length,
     })
 }

@@ -21,15 +21,13 @@ pub fn person() -> &'static Mesh {
     })
 }
 
-/// An inclined rectangle, visible from both sides. Its points satisfy `normal · p = 0.9`.
-pub fn rectangle() -> (Mesh, Vec3) {
+/// An inclined rectangle, visible from both sides.
+pub fn rectangle() -> Mesh {
     let (right, up) = (Vec3::new(0.8, 0.0, 0.25), Vec3::new(0.1, 0.9, 0.2));
     let centre = Vec3::new(0.0, 0.9, 0.05);
     let corners = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)];
-    let normal = right.cross(up).normalize();
     let positions = corners.map(|(a, b)| centre + a * right + b * up).to_vec();
-    let mesh = mesh(positions, [[0, 1, 2, 3]], Vec3::new(0.9, 0.5, 0.2));
-    (mesh, normal * (0.9 / normal.dot(centre)))
+    mesh(positions, [[0, 1, 2, 3]], Vec3::new(0.9, 0.5, 0.2))
 }
 
 /// Centre and half size of [`block`]. All of its views differ.

@@ -6,9 +6,10 @@ use std::collections::{BTreeSet, HashMap};
 use image::imageops::{FilterType, resize};
 use image::{GrayImage, RgbImage};
 
+use crate::EvalError;
 use crate::geometry::nearest;
 use crate::pictures::Picture;
-use crate::region::Region;
+use crate::region::{Region, margin};
 
 /// Steps of a channel that are told apart.
 const STEPS: f32 = 63.0;
@@ -47,8 +48,11 @@ impl Palette {
     }
 
     /// The traces of the background in a picture whose truth is `target`, with the person's share `mask` of each pixel.
-    /// `region` is the person with a margin.
-    pub fn traces(&self, image: &Picture, target: &Picture, mask: &[f32], region: &Region) -> Traces {
+    ///
+    /// # Errors
+    /// [`EvalError::Message`] for a mask without a person.
+    pub fn traces(&self, image: &Picture, target: &Picture, mask: &[f32]) -> Result<Traces, EvalError> {
+        let region = Region::masked(mask, [image.height, image.width], margin(image.height))?;
         let color = |of: &Picture, i: usize| [0, 1, 2].map(|c| of.plane(c)[i]);
         let own: Vec<usize> = (0..mask.len()).filter(|i| mask[*i] > 0.5).collect();
         let true_colors = own.iter().map(|i| cell(color(target, *i)));
@@ -59,7 +63,7 @@ impl Palette {
             .filter(|i| is_shown(i))
             .for_each(|i| *counts.entry(cell(color(image, *i))).or_default() += 1);
         let (cells, counts): (Vec<Cell>, Vec<usize>) = counts.into_iter().unzip();
-        let [cells, person, background] = [cells, list(&person), list(&self.background)].map(places);
+        let (cells, person, background) = (places(cells), places(person), places(self.background.clone()));
         let foreign = if background.is_empty() || person.is_empty() || cells.is_empty() {
             0
         } else {
@@ -70,7 +74,7 @@ impl Palette {
         let is_beside = |i: &usize| is_shown(i) && !region.counts(i % image.width, i / image.width);
         let beside = (0..mask.len()).filter(is_beside).count();
         let share = |count: usize| count as f64 / own.len().max(1) as f64;
-        Traces { foreign: share(foreign), beside: share(beside) }
+        Ok(Traces { foreign: share(foreign), beside: share(beside) })
     }
 }
 
@@ -87,11 +91,7 @@ fn cell(color: [f32; 3]) -> Cell {
     color.map(|v| (STEPS * v).round() as u8)
 }
 
-fn list(cells: &BTreeSet<Cell>) -> Vec<Cell> {
-    cells.iter().copied().collect()
-}
-
-fn places(cells: Vec<Cell>) -> Vec<[f32; 3]> {
+fn places(cells: impl IntoIterator<Item = Cell>) -> Vec<[f32; 3]> {
     cells.into_iter().map(|cell| cell.map(|v| f32::from(v) / STEPS)).collect()
 }
 
@@ -116,7 +116,6 @@ mod tests {
             Picture::from_file(pixels.into(), "picture").expect("a picture")
         };
         let share: Vec<f32> = mask.pixels().map(|m| f32::from(m[0]) / 255.0).collect();
-        let region = Region::masked(&share, [30, 30], 1).expect("a person");
         let target = picture(&|x, y| if is_person(x, y) { [220, 200, 30] } else { [0; 3] });
         // A column of the wall, a shade of the truth, a column beside the margin, and a hole.
         let image = picture(&|x, y| match x {
@@ -126,8 +125,9 @@ mod tests {
             _ if is_person(x, y) => [210, 190, 40],
             _ => [0; 3],
         });
-        assert_eq!(palette.traces(&image, &target, &share, &region), Traces { foreign: 0.1, beside: 0.1 });
-        assert_eq!(palette.traces(&target, &target, &share, &region), Traces { foreign: 0.0, beside: 0.0 });
+        let traces = |image| palette.traces(image, &target, &share).expect("a person");
+        assert_eq!(traces(&image), Traces { foreign: 0.1, beside: 0.1 });
+        assert_eq!(traces(&target), Traces { foreign: 0.0, beside: 0.0 });
     }
 
     #[test]

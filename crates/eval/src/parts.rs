@@ -2,6 +2,7 @@
 //! whole part does not count.
 
 use glam::{Vec2, Vec3};
+use snapsnap_net::median;
 use snapsnap_photo::Joint;
 
 use crate::points::{Pair, is_predicted, normal_error};
@@ -67,12 +68,9 @@ fn error(pair: &Pair, part: usize, side: usize) -> Option<PartError> {
     if off.len() < LEAST {
         return None;
     }
-    let shift = Vec3::from_array([0, 1, 2].map(|axis| {
-        let mut values: Vec<f32> = off.iter().flatten().map(|off| off[axis]).collect();
-        let middle = values.len() / 2;
-        if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
-    }));
-    let lengths = off.iter().flatten().map(|off| f64::from(off.distance(shift)));
+    let predicted: Vec<Vec3> = off.iter().flatten().copied().collect();
+    let shift = median(&predicted).unwrap_or_default();
+    let lengths = predicted.iter().map(|off| f64::from(off.distance(shift)));
     let near: Vec<f64> = lengths.filter(|length| *length < FAR).collect();
     Some(PartError {
         part,
@@ -84,7 +82,6 @@ fn error(pair: &Pair, part: usize, side: usize) -> Option<PartError> {
 
 #[cfg(test)]
 mod tests {
-
     use super::*;
 
     #[test]

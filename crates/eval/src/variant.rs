@@ -13,8 +13,8 @@ use snapsnap_splat::Preset;
 /// How many times as large as the compared pictures renders may be on each side.
 pub const SUPERSAMPLING: [usize; 3] = [1, 2, 4];
 
-/// A section `[ablations.NAME]` of an evaluation, or `[model]` or `[settings.NAME]` of a benchmark. Unset keys have
-/// the values of the model under test.
+/// The section `[model]`, a section `[ablations.NAME]` of an evaluation, or `[settings.NAME]` of a benchmark. Unset
+/// keys have the values of the model under test.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Variant {

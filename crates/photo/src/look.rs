@@ -7,7 +7,7 @@ use snapsnap_net::blazepose::{Pose, SIDE};
 
 use crate::joints::{Joint, Joints};
 use crate::rect::Rect;
-use crate::resize::interpolate;
+use crate::resize::{interpolate, reduced};
 use crate::specks::pieces;
 
 /// Longest side of the picture in which the network looks for the person.
@@ -198,16 +198,9 @@ struct Small {
 
 impl Small {
     fn new(picture: &RgbImage) -> Self {
-        let (width, height) = picture.dimensions();
-        let longest = width.max(height);
-        let reduced = |side: u32| (u64::from(side) * u64::from(LONGEST) / u64::from(longest)).max(1) as u32;
-        let small = if longest > LONGEST {
-            imageops::thumbnail(picture, reduced(width), reduced(height))
-        } else {
-            picture.clone()
-        };
-        let scale = Vec2::new(width as f32 / small.width() as f32, height as f32 / small.height() as f32);
-        Self { picture: small, scale }
+        let small = reduced(picture, LONGEST).unwrap_or_else(|| picture.clone());
+        let size = |picture: &RgbImage| Vec2::new(picture.width() as f32, picture.height() as f32);
+        Self { scale: size(picture) / size(&small), picture: small }
     }
 
     fn size(&self) -> Vec2 {

@@ -12,7 +12,7 @@ use super::specks::{Pieces, pieces};
 use super::unit_color;
 use crate::mask_strokes::paint;
 use crate::rect::Rect;
-use crate::resize::{bilinear, interpolate};
+use crate::resize::{bilinear, interpolate, reduced};
 
 /// Margin of the part in which the outline is looked for, around the person's box, as a share of the box's longer side.
 const MARGIN: f32 = 0.1;
@@ -68,11 +68,8 @@ pub fn matte(
     pose: &FindPose,
     strokes: Option<&GrayImage>,
 ) -> Option<Matte> {
-    let longest = picture.width().max(picture.height());
-    if longest > LONGEST {
-        let scaled = |side: u32| (u64::from(side) * u64::from(LONGEST) / u64::from(longest)).max(1) as u32;
-        // Unlike other filters, this one makes no copy in floats.
-        picture = imageops::thumbnail(&picture, scaled(picture.width()), scaled(picture.height()));
+    if let Some(small) = reduced(&picture, LONGEST) {
+        picture = small;
     }
     let whole = Rect { x: 0, y: 0, width: picture.width(), height: picture.height() };
     let look = Look::find(&picture, pose);

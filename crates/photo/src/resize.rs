@@ -1,10 +1,10 @@
-//! Resizing of one plane of values.
+//! Resizing of pictures and of planes of values.
 
 use std::ops::{Add, Mul};
 
 use burn::tensor::{Device, Tensor, TensorData};
 use image::imageops::{self, FilterType};
-use image::{ImageBuffer, Luma};
+use image::{ImageBuffer, Luma, RgbImage};
 use snapsnap_base::bilinear::Tap;
 use snapsnap_ops::host;
 
@@ -21,6 +21,15 @@ pub fn lanczos3(values: Vec<f32>, from: [usize; 2], to: [usize; 2]) -> Vec<f32> 
 pub fn bilinear(values: Vec<f32>, [rows, columns]: [usize; 2], to: [usize; 2]) -> Vec<f32> {
     let plane = Tensor::from_data(TensorData::new(values, [1, 1, rows, columns]), &Device::flex());
     host(snapsnap_ops::bilinear(plane, to, false))
+}
+
+/// The picture with a longer side of `longest` pixels; `None` if it is not longer.
+pub fn reduced(picture: &RgbImage, longest: u32) -> Option<RgbImage> {
+    let (width, height) = picture.dimensions();
+    let longer = width.max(height);
+    let scaled = |side: u32| (u64::from(side) * u64::from(longest) / u64::from(longer)).max(1) as u32;
+    // Unlike other filters, this one makes no copy in floats.
+    (longer > longest).then(|| imageops::thumbnail(picture, scaled(width), scaled(height)))
 }
 
 /// The value of a plane of `columns` columns between its samples, down and across.

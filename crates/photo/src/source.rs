@@ -29,6 +29,18 @@ pub enum Cutting {
     All,
 }
 
+impl Cutting {
+    /// The way that users call auto, network or none.
+    pub fn named(name: &str) -> Option<Self> {
+        Some(match name {
+            "auto" => Self::Missing,
+            "network" => Self::All,
+            "none" => Self::Given,
+            _ => return None,
+        })
+    }
+}
+
 /// Where the pixels of a photograph come from.
 #[derive(Clone, Copy)]
 pub enum Content<'a> {

@@ -104,11 +104,8 @@ pub fn parse(path: &Path, text: &str) -> Result<Vec<Camera>, FileError> {
         .collect()
 }
 
-/// Writes `cameras` to `path`, whole or not at all.
-///
-/// # Errors
-/// [`FileError::Write`].
-pub fn write(cameras: &[Camera], path: &Path) -> Result<(), FileError> {
+/// The text of a file of `cameras`.
+pub fn to_json(cameras: &[Camera]) -> String {
     let entry = |camera: &Camera| {
         let RigidTransform { rotation, translation } = camera.world_to_camera;
         let row = |i: usize| {
@@ -126,11 +123,15 @@ pub fn write(cameras: &[Camera], path: &Path) -> Result<(), FileError> {
         }
     };
     let entries: Vec<Entry> = cameras.iter().map(entry).collect();
-    write_whole(path, |out| {
-        serde_json::to_writer_pretty(&mut *out, &entries)?;
-        writeln!(out)
-    })
-    .map_err(FileError::write(path))
+    serde_json::to_string_pretty(&entries).expect("numbers") + "\n"
+}
+
+/// Writes `cameras` to `path`, whole or not at all.
+///
+/// # Errors
+/// [`FileError::Write`].
+pub fn write(cameras: &[Camera], path: &Path) -> Result<(), FileError> {
+    write_whole(path, |out| out.write_all(to_json(cameras).as_bytes())).map_err(FileError::write(path))
 }
 
 #[cfg(test)]

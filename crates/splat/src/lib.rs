@@ -16,6 +16,7 @@ mod render;
 pub mod scene;
 pub mod sh;
 mod sog;
+mod splat_file;
 mod spz;
 mod stored;
 

@@ -1,5 +1,5 @@
-//! Files of Gaussians: PLY, SPZ, GLB, and SOG, which is only written. The kind of a file follows from its first bytes
-//! when it is read, and from its extension when it is written.
+//! Files of Gaussians: PLY, SPZ, GLB, SOG, and .splat, which is only read. The kind of a file follows from its first
+//! bytes when it is read (a .splat has no first bytes of its own), and from its extension when it is written.
 
 use std::io::{self, Read, Write};
 use std::path::Path;
@@ -9,7 +9,7 @@ use snapsnap_base::{FileError, file};
 
 use crate::stored::Problem;
 pub use crate::stored::{Loaded, Stored};
-use crate::{Gaussians, SplatError, glb, ply, sog, spz};
+use crate::{Gaussians, SplatError, glb, ply, sog, splat_file, spz};
 
 /// First bytes of a ZIP archive.
 const ZIP: [u8; 2] = *b"PK";
@@ -23,7 +23,7 @@ pub enum Kind {
     Spz,
     /// Binary glTF with the extension `KHR_gaussian_splatting`.
     Glb,
-    /// PlayCanvas' compressed splats, which are only written.
+    /// PlayCanvas' compressed splats.
     Sog,
 }
 
@@ -47,7 +47,7 @@ impl Kind {
 }
 
 impl Stored {
-    /// Reads a file of any kind but SOG.
+    /// Reads a file of any kind.
     ///
     /// # Errors
     /// [`SplatError::File`] if the file cannot be read, is of another kind, is truncated, or lacks a property.
@@ -62,8 +62,11 @@ impl Stored {
         let read = match magic {
             spz::GZIP => spz::read(whole, length),
             glb::MAGIC => glb::read(whole, length),
-            ZIP => Err("a ZIP archive; a SOG is written, but not read".to_owned().into()),
-            spz::BARE => Err("SPZ of version 4 or later; 1 to 3 are read".to_owned().into()),
+            spz::BARE => spz::read_streams(whole, length),
+            ZIP => sog::read(whole, length),
+            _ if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("splat")) => {
+                splat_file::read(whole, length)
+            }
             _ => ply::read(whole),
         };
         let read = read.map_err(|problem| match problem {
@@ -92,11 +95,22 @@ impl Stored {
     /// # Errors
     /// As [`Self::write`].
     pub fn write_y_down(&self, path: &Path) -> Result<(), SplatError> {
+        let bytes = self.to_bytes_y_down()?;
+        Ok(file::write_whole(path, |out| out.write_all(&bytes)).map_err(FileError::write(path))?)
+    }
+
+    /// The bytes of [`Self::write_y_down`]'s file.
+    ///
+    /// # Errors
+    /// As [`Self::write`].
+    pub fn to_bytes_y_down(&self) -> Result<Vec<u8>, SplatError> {
+        let path = Path::new("memory");
         self.check(Kind::Ply, path)?;
         let mut turned = self.clone();
         turned.turn(false);
-        let written = file::write_whole(path, |out| ply::write(&turned, Some(ply::Y_DOWN), out));
-        Ok(written.map_err(FileError::write(path))?)
+        let mut bytes = Vec::new();
+        ply::write(&turned, Some(ply::Y_DOWN), &mut bytes).map_err(FileError::write(path))?;
+        Ok(bytes)
     }
 
     /// The bytes of a file of this kind.

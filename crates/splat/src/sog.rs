@@ -1,7 +1,10 @@
-//! PlayCanvas' SOG: quantised Gaussians as lossless pictures in a ZIP. Version 2 is written, without SH above degree 0.
+//! PlayCanvas' SOG: quantised Gaussians as lossless pictures in a ZIP. Version 2 is read, and written without SH above
+//! degree 0.
 //!
 //! Layout: developer.playcanvas.com, "The SOG Format". There y is up, but PlayCanvas' viewers turn a SOG, like a
 //! PLY, by 180° about z. The Gaussians are therefore stored turned, and appear upright and from the front.
+
+mod read;
 
 use std::io::{self, Cursor, Write};
 
@@ -12,6 +15,8 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
 use crate::stored::{Stored, opacity, unit};
+
+pub(crate) use read::read;
 
 /// Number of values in a codebook.
 const CODES: usize = 256;

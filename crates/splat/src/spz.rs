@@ -1,32 +1,33 @@
-//! Niantic's SPZ: quantised Gaussians, column by column, in one gzip stream. Version 3 is written, versions 1 to 3 are
-//! read. SH of degree 4 lose their highest degree.
+//! Niantic's SPZ: quantised Gaussians, column by column, in one gzip stream, or from version 4 on in a Zstandard stream
+//! for each kind of columns. Version 3 is written, versions 1 to 4 are read. SH of degree 4 lose their highest degree.
 //!
 //! The axes are x right, y up, z back, as in the world frame; nothing is rotated. Layout: github.com/nianticlabs/spz,
 //! README ("File Format").
 
 use std::io::{self, Read, Write};
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 use burn::tensor::f16;
 use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 
-use crate::stored::{COEFFICIENTS, Problem, Stored, unit};
+use crate::stored::{COEFFICIENTS, Problem, Stored, check_ratio, unit};
 
 /// First bytes of a gzip stream.
 pub(crate) const GZIP: [u8; 2] = [0x1f, 0x8b];
-/// First bytes of version 4 and later, which are not one gzip stream.
+/// First bytes of version 4, which is not one gzip stream.
 pub(crate) const BARE: [u8; 2] = *b"NG";
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
+/// The version whose columns have streams of their own.
+const STREAMS: u32 = 4;
+/// Bytes of its header, and of a stream's entry in the table behind it: compressed and decompressed length.
+const HEADER: usize = 32;
+const ENTRY: usize = 16;
 /// Number of Gaussians of the largest file that Niantic's library reads. It limits the memory for a hostile file,
 /// which may decompress to a thousand times its size.
 const MAX_POINTS: usize = 10_000_000;
-/// A file is refused if its decompressed size exceeds both limits, in bytes and relative to the file: a few kilobytes
-/// of equal Gaussians keep a rasteriser busy for minutes. Real files decompress to up to 5 times their size.
-const MAX_CONTENT: u64 = 1 << 20;
-const MAX_RATIO: u64 = 100;
 /// Most bytes of extensions that are read.
 const EXTENSIONS: u64 = 1 << 24;
 /// Fractional bits of coordinates, if they fit: steps of a quarter of a millimetre up to 2 km.
@@ -42,13 +43,56 @@ const SH_STEPS: [i32; 2] = [8, 16];
 pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
     let mut input = GzDecoder::new(input);
     let header = take(&mut input, 16, "the header")?;
-    let word = |at: usize| u32::from_le_bytes([header[at], header[at + 1], header[at + 2], header[at + 3]]);
+    let stored = columns(&header, 1..=VERSION, length, &mut |size, what| take(&mut input, size, what))?;
+    // Read to the end, so that the decoder verifies the checksum. Extensions after the Gaussians are skipped; if they
+    // are longer than `EXTENSIONS` bytes, the rest is not read.
+    io::copy(&mut input.take(EXTENSIONS), &mut io::sink()).map_err(damaged)?;
+    Ok(stored)
+}
+
+/// Reads a file of version 4 and of `length` bytes.
+pub(crate) fn read_streams(mut input: impl Read, length: u64) -> Result<Stored, Problem> {
+    let header = take(&mut input, HEADER, "the header")?;
+    let table = usize::try_from(word(&header, 16)).unwrap_or(usize::MAX);
+    let gap = table.checked_sub(HEADER).filter(|gap| (*gap as u64) < length);
+    let gap = gap.ok_or_else(|| "the table of its streams is not in the file".to_owned())?;
+    take(&mut input, gap, "extensions")?;
+    let table = take(&mut input, ENTRY * usize::from(header[15]), "the table of streams")?;
+    let mut entries = table.chunks_exact(ENTRY);
+    columns(&header, STREAMS..=STREAMS, length, &mut |size, what| {
+        let entry = entries.next().ok_or_else(|| format!("there is no stream of {what}"))?;
+        let compressed = u64::from_le_bytes(entry[..8].try_into().expect("eight bytes"));
+        let mut stream = (&mut input).take(compressed);
+        let damaged = |e: &dyn std::fmt::Display| Problem::from(format!("the stream of {what} is damaged: {e}"));
+        let decoder = ruzstd::decoding::StreamingDecoder::new(&mut stream).map_err(|e| damaged(&e))?;
+        let mut bytes = Vec::new();
+        decoder.take(size as u64 + 1).read_to_end(&mut bytes).map_err(|e| damaged(&e))?;
+        if bytes.len() != size {
+            return Err(damaged(&format_args!("{} bytes instead of {size}", bytes.len())));
+        }
+        io::copy(&mut stream, &mut io::sink())?;
+        Ok(bytes)
+    })
+}
+
+fn word(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"))
+}
+
+/// The Gaussians of a file with this header and a version among `versions`. `take` returns the next columns' bytes.
+fn columns(
+    header: &[u8],
+    versions: RangeInclusive<u32>,
+    length: u64,
+    take: &mut dyn FnMut(usize, &str) -> Result<Vec<u8>, Problem>,
+) -> Result<Stored, Problem> {
+    let word = |at: usize| word(header, at);
     if word(0) != MAGIC {
         return Err("a gzip stream, but no SPZ in it (its magic is missing)".to_owned().into());
     }
     let version = word(4);
-    if !(1..=VERSION).contains(&version) {
-        return Err(format!("SPZ of version {version}; 1 to {VERSION} are read").into());
+    if !versions.contains(&version) {
+        return Err(format!("SPZ of version {version}; 1 to {STREAMS} are read").into());
     }
     let n = word(8) as usize;
     if n > MAX_POINTS {
@@ -63,27 +107,21 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
     }
     // Values per channel.
     let there = (usize::from(degree) + 1).pow(2);
-    let size = if version == VERSION { 4 } else { 3 };
+    let size = if version >= VERSION { 4 } else { 3 };
     let centre = if version == 1 { 6 } else { 9 };
     let content = (n * (centre + 7 + size + 3 * (there - 1))) as u64;
-    if content > MAX_CONTENT && content / MAX_RATIO > length {
-        let ratio = content / length.max(1);
-        let message = format!(
-            "{n} Gaussians in {length} bytes: the content is {ratio} times as large as the file, which no real scene reaches"
-        );
-        return Err(message.into());
-    }
+    check_ratio(n, content, length)?;
     let coefficients = there.min(COEFFICIENTS[3]);
     let mut columns = Vec::with_capacity(Stored::COLUMNS.len() + 3 * (coefficients - 1));
 
     if version == 1 {
-        let halves = take(&mut input, 6 * n, "centres")?;
+        let halves = take(6 * n, "centres")?;
         for axis in 0..3 {
             let half = |p: &[u8]| f16::from_le_bytes([p[2 * axis], p[2 * axis + 1]]).to_f32();
             columns.push(halves.chunks_exact(6).map(half).collect());
         }
     } else {
-        let fixed = take(&mut input, 9 * n, "centres")?;
+        let fixed = take(9 * n, "centres")?;
         let unit = f64::from(bits).exp2().recip();
         for axis in 0..3 {
             let value = |p: &[u8]| {
@@ -94,10 +132,10 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
             columns.push(fixed.chunks_exact(9).map(value).collect());
         }
     }
-    let opacities: Vec<f32> = take(&mut input, n, "opacities")?.iter().map(|&a| logit(a)).collect();
-    let colors = take(&mut input, 3 * n, "colours")?;
-    let scales = take(&mut input, 3 * n, "scales")?;
-    let rotations = take(&mut input, size * n, "rotations")?;
+    let opacities: Vec<f32> = take(n, "opacities")?.iter().map(|&a| logit(a)).collect();
+    let colors = take(3 * n, "colours")?;
+    let scales = take(3 * n, "scales")?;
+    let rotations = take(size * n, "rotations")?;
     let mut quaternions = [(); 4].map(|()| Vec::with_capacity(n));
     for packed in rotations.chunks_exact(size) {
         let q = match *packed {
@@ -117,7 +155,7 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
     }
     if there > 1 {
         let stride = 3 * (there - 1);
-        let bands = take(&mut input, stride * n, "spherical harmonics")?;
+        let bands = take(stride * n, "spherical harmonics")?;
         for channel in 0..3 {
             for band in 0..coefficients - 1 {
                 let value = |s: &[u8]| (f32::from(s[3 * band + channel]) - 128.0) / 128.0;
@@ -125,9 +163,6 @@ pub(crate) fn read(input: impl Read, length: u64) -> Result<Stored, Problem> {
             }
         }
     }
-    // Read to the end, so that the decoder verifies the checksum. Extensions after the Gaussians are skipped; if they
-    // are longer than `EXTENSIONS` bytes, the rest is not read.
-    io::copy(&mut input.take(EXTENSIONS), &mut io::sink()).map_err(damaged)?;
     Ok(Stored { coefficients, columns })
 }
 

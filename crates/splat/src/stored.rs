@@ -204,6 +204,23 @@ impl From<String> for Problem {
     }
 }
 
+/// A compressed file is refused if its content exceeds both limits, in bytes and relative to the file: a few kilobytes
+/// of equal Gaussians keep a rasteriser busy for minutes. Real files decompress to up to 5 times their size.
+const MAX_CONTENT: u64 = 1 << 20;
+const MAX_RATIO: u64 = 100;
+
+/// Refuses `n` Gaussians with `content` decompressed bytes in a file of `length` bytes.
+pub(crate) fn check_ratio(n: usize, content: u64, length: u64) -> Result<(), Problem> {
+    if content <= MAX_CONTENT || content / MAX_RATIO <= length {
+        return Ok(());
+    }
+    let ratio = content / length.max(1);
+    let message = format!(
+        "{n} Gaussians in {length} bytes: the content is {ratio} times as large as the file, which no real scene reaches"
+    );
+    Err(message.into())
+}
+
 fn length(q: [f32; 4]) -> f64 {
     q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt()
 }

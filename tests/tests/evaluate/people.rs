@@ -40,9 +40,8 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
     let temporary = tempfile::tempdir().expect("a folder");
     let report = temporary.path().join("new/report");
     let other = weights(2).display().to_string();
-    let groups = "groups.loose.subjects=[\"0001\"]";
     let ablation = "ablations.sideless.sides=false";
-    let arguments = ["--against", &other, "--set", groups, "--set", "views.turns=[0, 3]"];
+    let arguments = ["--against", &other, "--set", "views.inputs=[3, 7]"];
     succeed(evaluate(people(), &report, &arguments).args(["--set", ablation]));
     let found = json(&report);
     for key in
@@ -65,15 +64,14 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
         let cells: Vec<&str> = line.split(',').collect();
         let sum = sums.entry([cells[0], cells[1], cells[2]]).or_default();
         let number = |i: usize| cells[i].parse::<f64>().expect("a number");
-        let of_side = if (45.0..=135.0).contains(&(number(5) % 180.0)) { 1.0 } else { 0.0 };
-        let values = [1.0, number(6), number(7), of_side * number(6), of_side];
+        let of_side = if (45.0..=135.0).contains(&(number(4) % 180.0)) { 1.0 } else { 0.0 };
+        let values = [1.0, number(5), number(6), of_side * number(5), of_side];
         values.iter().zip(sum).for_each(|(v, sum)| *sum += v);
     }
     let mean = |contestant: &str, protocol: &str, figure: usize| {
         let people = ["0000", "0001"].map(|name| {
             let sum = sums[&[contestant, protocol, name]];
-            // Six views for each of two turns.
-            assert_eq!(sum[0], 12.0);
+            assert_eq!(sum[0], 6.0, "views without the photographs");
             sum[figure] / sum[0]
         });
         (people[0] + people[1]) / 2.0
@@ -84,7 +82,7 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
     };
     for protocol in ["paper", "masked"] {
         let of = &found["protocols"][protocol];
-        assert_eq!((of["people"].as_u64(), of["views"].as_u64()), (Some(2), Some(24)));
+        assert_eq!((of["people"].as_u64(), of["views"].as_u64()), (Some(2), Some(12)));
         assert_eq!(of["subjects"].as_array().map(Vec::len), Some(2));
         let of_sides = of["sides_psnr"]["mean"].as_f64().expect("a figure");
         assert!((of_sides - sides(protocol)).abs() < 1e-9, "{of_sides} {}", sides(protocol));
@@ -111,15 +109,12 @@ fn a_report_has_its_keys_and_follows_from_its_tables() {
                 assert!((difference.expect("a number") - expected).abs() < 1e-9, "{other}: {difference:?}");
             }
         }
-        let group = &found["groups"]["loose"]["model"][protocol];
-        let subject = &of["subjects"][1];
-        assert_eq!((group["people"].as_u64(), &group["psnr"]["mean"]), (Some(1), &subject["psnr"]));
     }
     // Ground-truth points in the photographs' colours are better than cut-outs.
     let psnr = |value: &Value| value["masked"]["psnr"]["mean"].as_f64().expect("a number");
     assert!(psnr(&found["baselines"]["true_points"]) > psnr(&found["baselines"]["billboard"]) + 2.0);
     assert!(found["points_mm"]["front"]["mean"].as_f64().is_some_and(|mm| mm > 0.0));
-    for name in ["report.md", "people.png", "by_view.svg", "subjects.csv", "config.toml"] {
+    for name in ["report.md", "people.png", "by_view.svg", "config.toml"] {
         assert!(fs::metadata(report.join(name)).is_ok_and(|file| file.len() > 100), "{name}");
     }
     // A second run into the same folder has the same figures.
@@ -267,10 +262,7 @@ fn missing_and_damaged_parts_are_named_and_the_rest_evaluated() {
     assert!(all[0].starts_with("against: nowhere.safetensors") && all[1].starts_with("0815: "), "{all:?}");
     assert!(said.contains("0815") && said.contains("nowhere.safetensors"), "{said}");
 
-    // A group without people, and no compared view.
-    let (code, said) =
-        ended(&mut evaluate(people(), &report, &["--set", "groups.loose.subjects=[\"0815\"]"]));
-    assert!(code == Some(1) && said.contains("groups.loose"), "{said}");
+    // No compared view.
     let (code, said) = ended(&mut evaluate(people(), &report, &["--set", "views.compared=[0, 4]"]));
     assert!(code == Some(1) && said.contains("no view is left"), "{said}");
 
@@ -377,7 +369,7 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     wrong(&["--set", "ablations.a.knob=\"all\""], &["ablations.a.knob", "only settings of"]);
     wrong(&["--set", "ablations.a.supersampling=3"], &["ablations.a.supersampling", "1, 2 or 4"]);
     wrong(&["--set", "ablations.a.stride=0"], &["ablations.a.stride", "1 to 64"]);
-    wrong(&["--set", "model.devices=[\"cpu\", \"cpu\"]"], &["on cpu", "two ablations or devices"]);
+    wrong(&["--set", "model.knob=\"all\""], &["model.knob", "only settings of"]);
     wrong(&["--set", "report.people=9"], &["report.people"]);
     wrong(&["--set", "views.supersampling=3"], &["views.supersampling"]);
     wrong(&["--set", "metrics.protocols=[]"], &["metrics.protocols"]);
@@ -396,7 +388,6 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     let said = refused(&mut evaluate(temporary.path(), &report, &[]));
     assert!(said.contains("is no data set"), "{said}");
     wrong(&["--set", "metrics.protocols=[\"paper\", \"paper\"]"], &["metrics.protocols", "twice"]);
-    wrong(&["--set", "views.turns=[0, 0]"], &["views.turns", "twice"]);
     wrong(&["--set", "views.compared=[1, 99]"], &["no view 99, of 8", "views.compared"]);
     let again = format!(
         "data.folders=[{:?}, {:?}]",

@@ -106,7 +106,7 @@ pub fn make(folder: &Path, name: &str) {
             put(&path, [TRAINING, more].concat());
         }
         "e.toml" => {
-            let more = "[ablations.sideless]\nsides = false\n[groups.loose]\nsubjects = [\"a\"]\n";
+            let more = "[ablations.sideless]\nsides = false\n";
             put(&path, [include_str!("../../../configs/eval.toml"), more].concat());
         }
         "b.toml" => {

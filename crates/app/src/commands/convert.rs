@@ -8,14 +8,15 @@ use snapsnap_splat::scene::{Kind, Stored};
 
 use crate::batch::{self, KindArgument, ShardArgument, must_be_unused};
 use crate::failure::Failure;
-use crate::output::{check_kind, check_outputs};
-use crate::say;
+use crate::output::{self, check_kind, check_outputs};
+use crate::{page, say};
 
 #[derive(Args)]
 pub struct Arguments {
     /// File of Gaussians: PLY, SPZ, or GLB; or a folder of such files.
     input: PathBuf,
-    /// Output file: .ply, .spz, .glb (KHR_gaussian_splatting) or .sog; or a folder.
+    /// Output file: .ply, .spz, .glb (KHR_gaussian_splatting) or .sog; .html, a page that shows the scene by itself; or
+    /// a folder.
     output: PathBuf,
     #[command(flatten)]
     axes: AxesArguments,
@@ -37,9 +38,9 @@ pub struct AxesArguments {
 impl AxesArguments {
     /// Refuses y down for kinds of files whose axes viewers know.
     pub fn check(&self, output: &Path) -> Result<(), Failure> {
-        if self.y_down && Kind::of(output) != Kind::Ply {
+        if self.y_down && (Kind::of(output) != Kind::Ply || is_page(output)) {
             let message =
-                "--y-down is for PLYs: an SPZ and a GLB have y up by definition, and a SOG is turned already";
+                "--y-down is for PLYs: an SPZ and a GLB have y up by definition, a SOG and a page are turned already";
             return Err(Failure::file(output, message));
         }
         Ok(())
@@ -62,18 +63,32 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     one(input, output, axes)
 }
 
+/// Whether a page is to be written.
+fn is_page(output: &Path) -> bool {
+    output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html"))
+}
+
 /// Converts one file.
 fn one(input: &Path, output: &Path, axes: &AxesArguments) -> Result<(), Failure> {
-    check_kind(output)?;
+    let is_page = is_page(output);
+    let kind = if is_page { Kind::Spz } else { Kind::of(output) };
+    if !is_page {
+        check_kind(output)?;
+    }
     axes.check(output)?;
     check_outputs(&[output], &[input])?;
     let stored = read(input)?;
-    axes.write(&stored, output)?;
+    if is_page {
+        let name = input.file_stem().unwrap_or_default().to_string_lossy();
+        output::write(output, page::alone(&name, &stored.to_bytes(kind)?).as_bytes())?;
+    } else {
+        axes.write(&stored, output)?;
+    }
     if say::is_quiet() {
         return Ok(());
     }
     let say = say::beside(output);
-    for loss in stored.losses(Kind::of(output)) {
+    for loss in stored.losses(kind) {
         say(&format!("{}: {loss}", output.display()));
     }
     let size = |path: &Path| std::fs::metadata(path).map_or(0.0, |metadata| metadata.len() as f64 / 1e6);

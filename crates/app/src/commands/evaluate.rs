@@ -2,7 +2,6 @@
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
-use std::slice;
 use std::time::Instant;
 
 use burn::tensor::Device;
@@ -62,7 +61,7 @@ pub struct Arguments {
     /// Folder of the report.
     #[arg(short, long, value_name = "REPORT")]
     output: PathBuf,
-    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal [default: model.devices of the config].
+    /// auto, cpu, ndarray, wgpu, vulkan, cuda or metal [default: model.device of the config].
     #[arg(long)]
     device: Option<String>,
 }
@@ -82,20 +81,16 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     if let Some(meshes) = &arguments.mesh_dir {
         return judge_meshes(arguments, &config, &sets, meshes, missing);
     }
-    let names = match (&arguments.device, config.model.devices.as_slice()) {
-        (Some(name), _) => slice::from_ref(name),
-        (None, []) => &["auto".to_owned()],
-        (None, names) => names,
-    };
-    let devices = names.iter().map(|name| device::choose(name)).collect::<Result<Vec<_>, _>>()?;
-    let variants = config.variants(names);
+    let name = arguments.device.as_deref().or(config.model.device.as_deref()).unwrap_or("auto");
+    let device = device::choose(name)?;
+    let variants = config.variants(name);
     let inputs: Vec<&Path> = std::iter::once(&arguments.config)
         .chain(variants.iter().filter_map(|(_, variant)| variant.weights.as_ref()))
         .chain(&arguments.lpips.files)
         .map(PathBuf::as_path)
         .collect();
-    let lpips = arguments.lpips.load(&config.metrics.lpips, &names[0])?;
-    let contestants = contestants(&config, &variants, &devices[0], &mut missing);
+    let lpips = arguments.lpips.load(&config.metrics.lpips, name)?;
+    let contestants = contestants(&config, &variants, &device, &mut missing);
     if contestants.is_empty() {
         return Err(nothing_left("nothing is left to evaluate", &missing));
     }
@@ -109,7 +104,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let cost = Cost { seconds: start.elapsed().as_secs_f64(), memory: memory::most_used() };
     drop(progress);
     outcome.left_out.splice(0..0, missing);
-    let (header, lpips) = (header(&device::describe(&devices[0])), perceptual::describe(&lpips));
+    let (header, lpips) = (header(&device::describe(&device)), perceptual::describe(&lpips));
     let mut report = Evaluation { header, config: &config, outcome, lpips, cost };
     let mut pictures = Vec::new();
     let ranked = report.ranked(config.report.people);
@@ -128,7 +123,6 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         pictures.push("by_view.svg");
     }
     folder.text("views.csv", &report.views_csv())?;
-    folder.text("subjects.csv", &report.subjects_csv())?;
     folder.text("config.toml", &config.to_toml())?;
     folder.text("report.md", &report.markdown(&pictures))?;
     let json = report.json();

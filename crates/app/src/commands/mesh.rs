@@ -33,11 +33,11 @@ const COMPARABLE: f64 = 0.1;
 pub struct Arguments {
     /// File of Gaussians: PLY, SPZ or GLB; or a folder of such files.
     input: PathBuf,
-    /// Output file: .glb, .obj or .ply; or a folder.
+    /// Output file: .glb, .obj or .ply; .stl or .3mf, in millimetres, for printers; or a folder.
     #[arg(short, long, value_name = "FILE|DIR")]
     output: PathBuf,
     /// With a folder: kind of the meshes [default: glb].
-    #[arg(long, value_parser = ["glb", "obj", "ply"])]
+    #[arg(long, value_parser = ["glb", "obj", "ply", "stl", "3mf"])]
     kind: Option<String>,
     #[command(flatten)]
     shard: ShardArgument,
@@ -60,8 +60,8 @@ pub struct SurfaceArguments {
     /// Approximate number of triangles of the mesh; 0 keeps all [default: 100000].
     #[arg(long, value_name = "N")]
     faces: Option<usize>,
-    /// Side in pixels of a texture, 64 to 16384, or 0 for colours of vertices. A .ply has no texture [default: 2048
-    /// for .glb, else 0].
+    /// Side in pixels of a texture, 64 to 16384, or 0 for colours of vertices. Only .glb and .obj have textures
+    /// [default: 2048 for .glb, else 0].
     #[arg(long, value_name = "SIZE", value_parser = texture_side)]
     texture: Option<u32>,
 }
@@ -143,7 +143,7 @@ impl Target {
     pub fn new(path: &Path, surface: &SurfaceArguments) -> Result<Self, Failure> {
         let wrong = |message: &str| Err(Failure::file(path, message));
         let Some(kind) = Kind::named(path) else {
-            return wrong("is neither .glb nor .obj nor .ply; the extension says what to write");
+            return wrong("is no .glb, .obj, .ply, .stl or .3mf; the extension says what to write");
         };
         let name = path.file_name().unwrap_or_default().to_str();
         if kind == Kind::Obj && name.is_none_or(|name| name.contains(char::is_control)) {
@@ -151,8 +151,8 @@ impl Target {
         }
         let defaults = options(kind);
         let texture = surface.texture.map_or(defaults.texture, |side| side as usize);
-        if texture > 0 && kind == Kind::Ply {
-            return wrong("a PLY has no texture: leave out --texture, or write a .glb or .obj");
+        if texture > 0 && !kind.has_texture() {
+            return wrong("this kind has no texture: leave out --texture, or write a .glb or .obj");
         }
         let bytes = TEXEL * (texture as u64).pow(2);
         memory::check(&format!("--texture {texture}"), bytes, "choose a smaller one")?;

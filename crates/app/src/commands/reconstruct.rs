@@ -82,7 +82,7 @@ pub struct Arguments {
     #[arg(long, value_name = "OUT.gif|OUT.png|DIR")]
     turntable: Option<PathBuf>,
     /// Also make a mesh.
-    #[arg(long, value_name = "OUT.glb|.obj|.ply")]
+    #[arg(long, value_name = "OUT.glb|.obj|.ply|.stl|.3mf")]
     mesh: Option<PathBuf>,
     #[command(flatten)]
     pub surface: SurfaceArguments,
@@ -98,15 +98,6 @@ pub struct Arguments {
 }
 
 impl Arguments {
-    /// What separates the person from the background.
-    fn cutting(&self) -> Cutting {
-        match &*self.cutout {
-            "none" => Cutting::Given,
-            "network" => Cutting::All,
-            _ => Cutting::Missing,
-        }
-    }
-
     /// Reads the photographs of a person for the networks of a config. Prints doubts about them with `name` before
     /// each, or refuses them with --strict.
     pub fn read(
@@ -117,7 +108,8 @@ impl Arguments {
         name: &str,
     ) -> Result<Photographs, Failure> {
         let side = config.network.resolution;
-        let read = snapsnap_photo::read(sources, self.cutting(), side, told.placement(config), told.focal)?;
+        let cutting = Cutting::named(&self.cutout).expect("one of the allowed values");
+        let read = snapsnap_photo::read(sources, cutting, side, told.placement(config), told.focal)?;
         let doubts: Vec<String> = read.doubts.iter().map(ToString::to_string).collect();
         if self.strict && !doubts.is_empty() {
             bail!("{} (--strict)", doubts.join("; "));

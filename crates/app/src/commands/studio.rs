@@ -16,7 +16,7 @@ use image::{GrayImage, ImageFormat};
 use serde_json::{Value, json};
 use snapsnap_mesh::picture;
 use snapsnap_net::Reconstructor;
-use snapsnap_photo::{Content, Cutting, Doubt, Figure, Joint, Sign, Source, Told, cut_out, person};
+use snapsnap_photo::{Content, Cutting, Doubt, Figure, Joint, Sign, Source, cut_out, person};
 use snapsnap_splat::scene::Stored;
 
 use crate::downloads::{self, Download};
@@ -47,7 +47,8 @@ const QUALITY: u8 = 90;
 const KEPT: usize = 4;
 
 struct Studio {
-    told: Told,
+    /// What the user says on the command line.
+    camera: CameraArguments,
     /// For one job at a time.
     networks: Mutex<Reconstructor>,
     /// The last people, under their names in addresses.
@@ -66,11 +67,11 @@ struct Person {
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let weights = arguments.model.open()?;
-    let told = arguments.camera.told(&weights.config, false)?;
+    arguments.camera.told(&weights.config, false)?;
     let device = arguments.model.device(&weights)?;
     let (networks, _) = arguments.model.load(&weights, &device)?;
     let studio = Studio {
-        told,
+        camera: arguments.camera,
         networks: Mutex::new(networks),
         people: Mutex::default(),
         made: AtomicUsize::new(0),
@@ -160,7 +161,13 @@ impl Studio {
             Source { content, strokes: all[i], ..Source::file(names[i]) }
         };
         job.step("photographs");
-        let (config, told) = (networks.config(), &self.told);
+        let config = networks.config();
+        let told = self.camera.updated(request.told.as_deref().unwrap_or("{}"));
+        // A page has no options, whose dashes the message begins with.
+        let wrong = |e: Failure| {
+            text(StatusCode::UNPROCESSABLE_ENTITY, e.to_string().trim_start_matches('-'))
+        };
+        let told = &told.and_then(|camera| camera.told(config, false)).map_err(wrong)?;
         let (side, placement) = (config.network.resolution, told.placement(config));
         let mut read =
             snapsnap_photo::read(&[source(0), source(1)], Cutting::Missing, side, placement, told.focal)?;

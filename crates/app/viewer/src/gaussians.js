@@ -17,6 +17,12 @@ function forEachVisible(mesh, use) {
   });
 }
 
+/** Whether a file of Gaussians has y down: a SOG has by definition, a PLY says so in a comment of this program. */
+export function hasYDown(bytes, name) {
+  const start = new TextDecoder("latin1").decode(bytes.subarray(0, 4096)).split("end_header")[0];
+  return /\.sog$/i.test(name) || (start.startsWith("ply") && start.includes("comment axes: y down"));
+}
+
 /** The bounding box of visible Gaussians, without the outermost 0.2 % at each end, which may be outliers. */
 export function bounds(mesh) {
   const along = { x: [], y: [], z: [] };

@@ -5,8 +5,9 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { fetched } from "./asking.js";
 import { inBatches } from "./batches.js";
-import { bounds, nearestTo } from "./gaussians.js";
+import { bounds, hasYDown, nearestTo } from "./gaussians.js";
 import { listen } from "./keys.js";
+import { openLan } from "./lan.js";
 import { save, saveLong } from "./saving.js";
 import { openStudio } from "./studio.js";
 import "./style.css";
@@ -30,6 +31,7 @@ let showMade = async () => {};
 const isStudio = document.documentElement.classList.contains("studio");
 if (isStudio) {
   element("downloads").classList.add("hidden");
+  openLan();
   openStudio((name) => {
     address = `./people/${name}/`;
     links.forEach(([link, file]) => link.setAttribute("href", address + file));
@@ -143,13 +145,18 @@ function lookAt(mesh) {
 }
 
 function resize() {
-  renderer.setPixelRatio(window.devicePixelRatio);
-  renderer.setSize(window.innerWidth, window.innerHeight, false);
-  camera.aspect = window.innerWidth / window.innerHeight;
-  camera.updateProjectionMatrix();
-  redraw();
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  if (width > 0 && height > 0) {
+    renderer.setPixelRatio(window.devicePixelRatio);
+    renderer.setSize(width, height, false);
+    camera.aspect = width / height;
+    camera.updateProjectionMatrix();
+    redraw();
+  }
 }
 window.addEventListener("resize", resize);
+// On small screens the buttons take a part of the window.
+new ResizeObserver(resize).observe(canvas);
 canvas.addEventListener("webglcontextrestored", () => {
   // The new context needs Spark's textures again.
   shown?.updateVersion();
@@ -165,10 +172,10 @@ async function show(what, read) {
   asked += 1;
   const own = asked;
   say("Loading …");
-  let mesh, name, served;
+  let mesh, name, served, overturned;
   try {
     const file = await read();
-    ({ name, served } = file);
+    ({ name, served, overturned } = file);
     mesh = new SplatMesh({ fileBytes: file.bytes, fileName: name, fileType: file.type, extSplats: true });
     await mesh.initialized;
   } catch (error) {
@@ -186,6 +193,7 @@ async function show(what, read) {
     shown.dispose();
   }
   shown = mesh;
+  mesh.rotation.x = overturned ? Math.PI : 0;
   scene.add(mesh);
   lookAt(mesh);
   element("name").textContent = name;
@@ -203,11 +211,22 @@ async function served() {
   return { bytes: new Uint8Array(await answer.arrayBuffer()), name, type: SplatFileType.PLY, served: true };
 }
 
+/** The scene in a page that `snapsnap convert` wrote. */
+const inside = element("scene");
+
+function contained() {
+  const bytes = Uint8Array.from(atob(inside.textContent), (letter) => letter.charCodeAt(0));
+  return { bytes, name: inside.dataset.name, type: SplatFileType.SPZ };
+}
+
 window.addEventListener("drop", (event) => {
   // A photograph beside its place is no scene.
   const file = document.body.classList.contains("making") ? null : event.dataTransfer.files[0];
   if (file) {
-    show(file.name, async () => ({ bytes: new Uint8Array(await file.arrayBuffer()), name: file.name }));
+    show(file.name, async () => {
+      const bytes = new Uint8Array(await file.arrayBuffer());
+      return { bytes, name: file.name, overturned: hasYDown(bytes, file.name) };
+    });
   }
 });
 
@@ -302,8 +321,9 @@ function turnOver() {
 
 /** Moves the centre of turning to the Gaussian below the pointer. */
 canvas.addEventListener("dblclick", (event) => {
-  const at = new THREE.Vector2(event.clientX, window.innerHeight - event.clientY);
-  const place = shown && nearestTo(shown, camera, at.divide(new THREE.Vector2(window.innerWidth, window.innerHeight)));
+  const box = canvas.getBoundingClientRect();
+  const at = new THREE.Vector2((event.clientX - box.left) / box.width, (box.bottom - event.clientY) / box.height);
+  const place = shown && nearestTo(shown, camera, at);
   if (place) {
     hold();
     camera.position.add(place).sub(controls.target);
@@ -375,6 +395,6 @@ renderer.setAnimationLoop((now) => {
 background();
 lookFrom(0);
 showMade = () => show("Cannot show the person", served);
-const ready = isStudio ? Promise.resolve() : show("Cannot show the file", served);
+const ready = isStudio ? Promise.resolve() : show("Cannot show the file", inside ? contained : served);
 // For tests and the browser's console.
 window.snapsnap = { ready, camera: cameraEntry, target: () => controls.target.toArray(), screenshot, lookFrom, renderer, spark };

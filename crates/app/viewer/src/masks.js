@@ -20,37 +20,97 @@ const SEEN = 0.5;
 const canvasOf = (width, height) => Object.assign(document.createElement("canvas"), { width, height });
 
 export class Drawing {
-  /** `drawn` gets the number of strokes after each. */
+  /** `drawn` is called after each change of the strokes. */
   constructor(canvas, drawn) {
     this.canvas = canvas;
     this.drawn = drawn;
     this.keeps = true;
     this.width = WIDTH;
+    this.ring = canvas.parentElement.querySelector(".ring");
     this.clear();
+    // Mouse and pen. One finger scrolls, two paint.
     canvas.addEventListener("pointerdown", (event) => {
-      if (this.picture && event.button === 0 && !this.current) {
+      if (event.pointerType !== "touch" && event.button === 0 && this.begin()) {
         canvas.setPointerCapture(event.pointerId);
         this.pointer = event.pointerId;
-        this.current = { keeps: this.keeps, width: this.width * Math.max(canvas.width, canvas.height), points: [], shown: 0 };
-        this.lines.push(this.current);
         this.extend(event);
       }
     });
     canvas.addEventListener("pointermove", (event) => {
+      this.showRing(event.pointerType === "touch" ? null : event);
       if (this.current && event.pointerId === this.pointer) {
         // A fast hand moves several times between two events.
         (event.getCoalescedEvents?.() ?? []).forEach((moved) => this.place(moved));
         this.extend(event);
       }
     });
+    canvas.addEventListener("pointerleave", () => this.showRing(null));
     for (const kind of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(kind, (event) => {
-        if (event.pointerId === this.pointer) {
-          this.current = null;
-          this.drawn(this.lines.length);
+      canvas.addEventListener(kind, (event) => event.pointerId === this.pointer && this.end());
+    }
+    const middle = ([a, b]) => ({ clientX: (a.clientX + b.clientX) / 2, clientY: (a.clientY + b.clientY) / 2 });
+    canvas.addEventListener("touchstart", (event) => {
+      if (event.touches.length === 2 && this.begin()) {
+        event.preventDefault();
+        this.showRing(middle(event.touches));
+        this.extend(middle(event.touches));
+      }
+    });
+    canvas.addEventListener("touchmove", (event) => {
+      if (event.touches.length === 2) {
+        event.preventDefault();
+        if (this.current) {
+          this.showRing(middle(event.touches));
+          this.extend(middle(event.touches));
         }
+      }
+    });
+    for (const kind of ["touchend", "touchcancel"]) {
+      canvas.addEventListener(kind, () => {
+        this.showRing(null);
+        this.end();
       });
     }
+  }
+
+  /** Begins a line if there is a picture and no other line. */
+  begin() {
+    if (!this.picture || this.current) {
+      return false;
+    }
+    this.current = { keeps: this.keeps, width: this.width * Math.max(this.canvas.width, this.canvas.height), points: [], shown: 0 };
+    this.lines.push(this.current);
+    this.undone = [];
+    return true;
+  }
+
+  end() {
+    if (this.current) {
+      this.current = null;
+      this.pointer = null;
+      this.drawn();
+    }
+  }
+
+  /** Shows the brush's size at the place of an event. */
+  showRing(event) {
+    this.ring.classList.toggle("hidden", !event || !this.picture);
+    if (event) {
+      const [box, around] = [this.canvas, this.ring.parentElement].map((part) => part.getBoundingClientRect());
+      const size = this.width * Math.max(box.width, box.height);
+      Object.assign(this.ring.style, {
+        width: `${size}px`,
+        height: `${size}px`,
+        left: `${event.clientX - around.left + this.ring.parentElement.scrollLeft}px`,
+        top: `${event.clientY - around.top + this.ring.parentElement.scrollTop}px`,
+        borderColor: this.keeps ? "#fff" : "#f66",
+      });
+    }
+  }
+
+  /** Enlarges the picture in its frame, which then scrolls. */
+  zoom(factor) {
+    this.canvas.style.setProperty("--zoom", factor);
   }
 
   setWidth(share) {
@@ -62,8 +122,9 @@ export class Drawing {
     this.joints = [];
     this.notes = {};
     this.lines = [];
+    this.undone = [];
     this.current = null;
-    this.drawn?.(0);
+    this.drawn?.();
   }
 
   /** Shows a picture and its mask, white on the person, both of one size, and the person's joints. */
@@ -72,6 +133,7 @@ export class Drawing {
     this.picture = picture;
     this.joints = joints;
     [this.canvas.width, this.canvas.height] = [picture.width, picture.height];
+    this.canvas.style.setProperty("--aspect", picture.width / picture.height);
     // A canvas masks by transparency, not by brightness.
     const grey = canvasOf(mask.width, mask.height).getContext("2d");
     grey.drawImage(mask, 0, 0);
@@ -87,12 +149,20 @@ export class Drawing {
   }
 
   undo() {
-    if (this.current) {
+    this.move(this.lines, this.undone);
+  }
+
+  redo() {
+    this.move(this.undone, this.lines);
+  }
+
+  move(from, to) {
+    if (this.current || from.length === 0) {
       return;
     }
-    this.lines.pop();
+    to.push(from.pop());
     this.renew();
-    this.drawn(this.lines.length);
+    this.drawn();
   }
 
   place(event) {

@@ -16,23 +16,20 @@ const notesOf = (signs) => Object.fromEntries(signs.flatMap(({ note, parts }) =>
 class Photograph {
   constructor(side, changed) {
     this.root = element("photograph").content.cloneNode(true).firstElementChild;
-    this.root.dataset.side = side.toLowerCase();
-    this.root.querySelector("h2").textContent = side;
-    this.root.setAttribute("aria-label", `${side} photograph`);
-    this.root.querySelector("canvas").setAttribute("aria-label", `${side} photograph; paint to correct what belongs to the person`);
-    element("pair").append(this.root);
+    this.call(side);
     this.changed = changed;
     this.file = null;
     this.signs = [];
     this.asked = 0;
-    this.drawing = new Drawing(this.root.querySelector("canvas"), (strokes) => this.drawn(strokes));
+    this.drawing = new Drawing(this.root.querySelector("canvas"), () => this.drawn());
     const part = (selector) => this.root.querySelector(selector);
-    const input = part("input[type=file]");
-    input.addEventListener("change", () => {
-      this.use(input.files[0]);
-      // The same file may be chosen again.
-      input.value = "";
-    });
+    for (const input of this.root.querySelectorAll("input[type=file]")) {
+      input.addEventListener("change", () => {
+        this.use(input.files[0]);
+        // The same file may be chosen again.
+        input.value = "";
+      });
+    }
     for (const kind of ["dragover", "dragleave", "drop"]) {
       this.root.addEventListener(kind, (event) => {
         event.preventDefault();
@@ -43,18 +40,45 @@ class Photograph {
       event.stopPropagation();
       this.use(event.dataTransfer.files[0]);
     });
-    const camera = part(".camera");
-    camera.classList.toggle("hidden", !navigator.mediaDevices?.getUserMedia);
-    camera.addEventListener("click", async () => this.use(await takePicture((text) => this.say(text))));
+    // A telephone has a camera program of its own.
+    const isTouched = matchMedia("(pointer: coarse)").matches;
+    part(".shoot").classList.toggle("hidden", !isTouched);
+    part(".camera").classList.toggle("hidden", isTouched || !navigator.mediaDevices?.getUserMedia);
+    part(".camera").addEventListener("click", () => this.take());
     part(".other").addEventListener("click", () => this.clear());
     part(".undo").addEventListener("click", () => this.drawing.undo());
+    part(".redo").addEventListener("click", () => this.drawing.redo());
     for (const brush of this.root.querySelectorAll(".brush")) {
       brush.addEventListener("click", () => this.choose(brush));
     }
-    const width = part("input[type=range]");
+    const width = part(".width");
     width.addEventListener("input", () => this.drawing.setWidth(Number(width.value)));
+    const zoom = part(".zoom");
+    zoom.addEventListener("input", () => this.drawing.zoom(zoom.value));
     this.choose(part(".brush"));
-    this.drawn(0);
+    this.drawn();
+  }
+
+  /** Makes it the front or the back. */
+  call(side) {
+    this.root.dataset.side = side.toLowerCase();
+    this.root.querySelector("h2").textContent = side;
+    this.root.setAttribute("aria-label", `${side} photograph`);
+    this.root.querySelector("canvas").setAttribute("aria-label", `${side} photograph; paint to correct what belongs to the person`);
+    element("pair").append(this.root);
+  }
+
+  /** Takes a picture, and then the other side's if it is missing. */
+  async take() {
+    const side = this.root.querySelector("h2").textContent;
+    const picture = await takePicture(side, (text) => this.say(text));
+    if (picture) {
+      this.use(picture);
+      const other = this.other();
+      if (!other.file && !other.busy) {
+        other.take();
+      }
+    }
   }
 
   choose(brush) {
@@ -64,8 +88,13 @@ class Photograph {
     this.drawing.keeps = brush.dataset.keeps === "true";
   }
 
-  drawn(strokes) {
-    this.root.querySelector(".undo").disabled = strokes === 0;
+  drawn() {
+    this.root.querySelector(".undo").disabled = this.drawing.lines.length === 0;
+    this.root.querySelector(".redo").disabled = this.drawing.undone.length === 0;
+  }
+
+  get busy() {
+    return this.root.classList.contains("busy");
   }
 
   say(text) {
@@ -138,8 +167,40 @@ export function openStudio(show) {
     element("warnings").replaceChildren();
     changed();
   };
-  const photographs = ["Front", "Back"].map((side) => new Photograph(side, () => exchanged()));
+  const sides = ["Front", "Back"];
+  const photographs = sides.map((side) => new Photograph(side, () => exchanged()));
+  photographs.forEach((photograph) => {
+    photograph.other = () => photographs.find((other) => other !== photograph);
+  });
   changed();
+  element("swap").addEventListener("click", () => {
+    photographs.reverse().forEach((photograph, i) => photograph.call(sides[i]));
+    exchanged();
+  });
+  let painted = photographs[0];
+  photographs.forEach((photograph) => {
+    photograph.root.addEventListener("pointerdown", () => {
+      painted = photograph;
+    });
+  });
+  window.addEventListener("keydown", (event) => {
+    const key = event.key.toLowerCase();
+    const isOpen = document.body.classList.contains("making") && event.target.tagName !== "INPUT";
+    if (isOpen && (event.ctrlKey || event.metaKey) && ["z", "y"].includes(key)) {
+      event.preventDefault();
+      if (key === "y" || event.shiftKey) {
+        painted.drawing.redo();
+      } else {
+        painted.drawing.undo();
+      }
+    }
+  });
+  // A reload would lose them.
+  window.addEventListener("beforeunload", (event) => {
+    if (photographs.some(({ file }) => file)) {
+      event.preventDefault();
+    }
+  });
   const say = (text) => {
     element("work").textContent = text;
   };
@@ -168,7 +229,8 @@ export function openStudio(show) {
       const files = photographs.map((photograph) => photograph.file);
       const strokes = await Promise.all(photographs.map((photograph) => photograph.drawing.strokes()));
       const parts = [...files, ...strokes];
-      const headers = { "X-Parts": parts.map((part) => part.size).join(",") };
+      const told = Object.fromEntries(["height", "focal"].map((name) => [name, element(name).value]).filter(([, value]) => value));
+      const headers = { "X-Parts": parts.map((part) => part.size).join(","), "X-Told": JSON.stringify(told) };
       const start = performance.now();
       const step = (name) => isWanted() && say(`${name} … ${Math.round((performance.now() - start) / 1000)} s`);
       step("sending");

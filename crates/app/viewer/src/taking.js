@@ -7,22 +7,23 @@ const DELAY = 10;
 
 let taking = false;
 
-/** A picture from the camera, or nothing after an error, which `say` gets, or "Cancel". */
-export async function takePicture(say) {
+/** A picture of a side from the camera, or nothing after an error, which `say` gets, or "Cancel". */
+export async function takePicture(side, say) {
   // The browser may still be asking whether the page may use the camera.
   if (taking) {
     return null;
   }
   taking = true;
   try {
-    return await take(say);
+    return await take(side, say);
   } finally {
     taking = false;
   }
 }
 
-async function take(say) {
+async function take(side, say) {
   const dialog = element("taking");
+  dialog.querySelector("h2").textContent = side;
   const video = dialog.querySelector("video");
   let stream;
   try {

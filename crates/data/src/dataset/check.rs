@@ -12,6 +12,7 @@ use super::write::UNFINISHED;
 use super::{Arrangement, DepthMap, Description, Folder, Layout, Person, Split, name};
 use snapsnap_base::FileError;
 use snapsnap_base::folder::entries;
+use snapsnap_net::dilated;
 
 /// Largest share of the person without depth. Scans have gaps narrower than a pixel.
 const HOLES: f64 = 0.01;
@@ -132,15 +133,9 @@ fn faults(folder: &Folder, person: Person<'_>, view: usize) -> (Vec<String>, Opt
     }
     let (Some(mask), Some(depth)) = (mask, depth) else { return (problems, None) };
     // Coverage and depth sample may differ by a pixel at the silhouette, but not inside it.
-    let (width, height) = mask.dimensions();
-    let inside = |x: u32, y: u32| {
-        (x.saturating_sub(1)..=(x + 1).min(width - 1))
-            .all(|x| (y.saturating_sub(1)..=(y + 1).min(height - 1)).all(|y| seen(mask.get_pixel(x, y).0[0])))
-    };
-    let missing = (0..height)
-        .flat_map(|y| (0..width).map(move |x| (x, y)))
-        .filter(|&(x, y)| depth[(y * width + x) as usize] <= 0.0 && inside(x, y))
-        .count();
+    let outside: Vec<bool> = mask.as_raw().iter().map(|v| !seen(*v)).collect();
+    let outside = dilated(&outside, mask.width() as usize, 1);
+    let missing = depth.iter().zip(outside).filter(|(z, outside)| **z <= 0.0 && !outside).count();
     // Gaps narrower than a pixel are lines.
     let area = pixels.unwrap_or(0) as f64;
     if missing as f64 > (HOLES * area).max(area.sqrt()) {
@@ -154,7 +149,7 @@ fn faults(folder: &Folder, person: Person<'_>, view: usize) -> (Vec<String>, Opt
         }
     }
     // Empty and tiny views cannot be compared.
-    let camera = camera.filter(|_| pixels != Some(0) && width >= LEAST_SIDE);
+    let camera = camera.filter(|_| pixels != Some(0) && mask.width() >= LEAST_SIDE);
     let camera = camera.map(|camera| folder.exact_camera(&camera));
     let seen = camera.map(|camera| Seen::new(&DepthMap { depth, camera }, &mask));
     (problems, seen)

@@ -2,6 +2,7 @@
 
 use glam::{DVec2, DVec3};
 use image::GrayImage;
+use snapsnap_net::dilated;
 use snapsnap_splat::{Camera, RigidTransform};
 
 use super::DepthMap;
@@ -40,12 +41,9 @@ impl Seen {
             }
             is_cut |= x == 0 || y == 0 || x + 1 == width || y + 1 == width;
             let cell = |v: u32| (u64::from(v) * u64::from(side) / u64::from(width)) as u32;
-            for y in cell(y).saturating_sub(1)..=(cell(y) + 1).min(side - 1) {
-                for x in cell(x).saturating_sub(1)..=(cell(x) + 1).min(side - 1) {
-                    outline[(y * side + x) as usize] = true;
-                }
-            }
+            outline[(cell(y) * side + cell(x)) as usize] = true;
         }
+        let outline = dilated(&outline, side as usize, 1);
         let points: Vec<DVec3> = map.points(&RigidTransform::IDENTITY).flatten().collect();
         let points = points.iter().step_by(points.len().div_ceil(POINTS).max(1)).copied().collect();
         Self { camera: map.camera, points, outline, side, is_cut }

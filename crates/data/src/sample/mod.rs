@@ -20,6 +20,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use snapsnap_net::Photograph;
+use snapsnap_net::config::OPPOSITE;
 use snapsnap_photo::{Cutting, Photographs, Placement, Source as Picture};
 use snapsnap_splat::Camera;
 
@@ -34,8 +35,6 @@ pub use stage1::{Stage1, Stage1Batch, Stage1Item};
 pub use stage2::{Stage2, Stage2Item};
 pub use test_set::{Test, TestItem};
 
-/// Degrees between front and back.
-const OPPOSITE: f64 = 180.0;
 /// Least mask value, of 255, at which a pixel counts as the person.
 const INSIDE: u8 = 128;
 
@@ -130,24 +129,20 @@ impl SampleConfig {
             let message = "needs `samples.upright = true`: a placed photograph shows no camera's elevation";
             return Some(("placed_share".into(), message.into()));
         }
-        let beside_compat = [
+        let wrong = [
             ("front_within_degrees", "must be 180", self.front_within_degrees != 180.0),
             ("augment", "must be off", self.augment != Augment::none()),
             ("placed_share", "must be 0", self.placed_share > 0.0),
             ("upright", "must be false", self.upright),
         ];
-        if let Some((key, message, _)) = beside_compat.into_iter().find(|(.., wrong)| self.compat && *wrong) {
-            return Some((key.into(), format!("{message} with `mode.compat = true`")));
-        }
         // Photographs of neighbouring views keep their known cameras.
-        let beside_neighbours = [
-            ("placed_share", "must be 0", self.placed_share > 0.0),
-            ("upright", "must be false", self.upright),
-        ];
-        let is_pair = self.pair_degrees == OPPOSITE;
-        if let Some((key, message, _)) = beside_neighbours.into_iter().find(|(.., wrong)| !is_pair && *wrong)
-        {
-            return Some((key.into(), format!("{message} unless `network.pair_degrees` is 180")));
+        for (is_set, rows, why) in [
+            (self.compat, &wrong[..], "with `mode.compat = true`"),
+            (self.pair_degrees != OPPOSITE, &wrong[2..], "unless `network.pair_degrees` is 180"),
+        ] {
+            if let Some((key, message, _)) = rows.iter().find(|(.., wrong)| is_set && *wrong) {
+                return Some(((*key).into(), format!("{message} {why}")));
+            }
         }
         self.augment.problem().map(|(key, message)| (format!("augment.{key}"), message))
     }

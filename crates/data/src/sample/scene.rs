@@ -4,7 +4,9 @@ use glam::Vec3;
 use image::{GrayImage, RgbImage, imageops};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
+use snapsnap_photo::Rect;
 
+use super::INSIDE;
 use super::augment::compressed;
 
 /// What is behind a person.
@@ -83,10 +85,9 @@ fn bytes(color: Vec3) -> image::Rgb<u8> {
 
 /// Mean colour, in [0, 1], of the person's pixels in the upper half of its rows; grey without one.
 fn upper_mean(color: &RgbImage, mask: &GrayImage) -> Vec3 {
-    let inside = |(_, _, share): &(u32, u32, &image::Luma<u8>)| share[0] >= 128;
-    let rows = || mask.enumerate_pixels().filter(inside).map(|(_, y, _)| y);
-    let Some((top, bottom)) = rows().min().zip(rows().max()) else { return Vec3::splat(0.5) };
-    let upper = mask.enumerate_pixels().filter(inside).filter(|(_, y, _)| *y <= top.midpoint(bottom));
+    let Some(person) = Rect::around(mask, INSIDE) else { return Vec3::splat(0.5) };
+    let middle = person.y + (person.height - 1) / 2;
+    let upper = mask.enumerate_pixels().filter(|(_, y, share)| share[0] >= INSIDE && *y <= middle);
     let (sum, count) = upper.fold((Vec3::ZERO, 0.0), |(sum, count), (x, y, _)| {
         (sum + Vec3::from(color.get_pixel(x, y).0.map(f32::from)), count + 1.0)
     });

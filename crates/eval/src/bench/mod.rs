@@ -123,7 +123,7 @@ pub fn measure(
         device.sync().expect("the device finishes its work");
         Ok(model)
     })?;
-    let inputs = people.inputs(&eval.views, 0);
+    let inputs = people.inputs(&eval.views);
     let read = || people.item(first, &inputs, &model.photographs);
     read()?;
     let (item, reading) = timed(runs.min(FEW), || {

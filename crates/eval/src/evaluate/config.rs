@@ -22,16 +22,14 @@ pub struct EvalConfig {
     pub views: ViewsSection,
     /// Changes to the photographs for models. Baselines get unchanged photographs.
     pub photographs: PhotographChanges,
-    /// The model under test.
-    pub model: ModelSection,
+    /// The model under test. `--weights` and `--device` replace its weights and its device.
+    pub model: Variant,
     /// Metrics.
     pub metrics: MetricsSection,
     /// Baselines.
     pub baselines: BaselineSection,
     /// Variants of the model by name. Each is compared with the model, person by person.
     pub ablations: BTreeMap<String, Variant>,
-    /// Groups of subjects with figures of their own, such as people in loose clothes.
-    pub groups: BTreeMap<String, Group>,
     /// Pictures of the report.
     pub report: ReportSection,
 }
@@ -85,11 +83,10 @@ impl Default for DataSection {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ViewsSection {
-    /// Input views; empty: the first and the opposite view. Of more than two, each view and the next around the circle
-    /// are a pair of photographs with known cameras and no unseen sides. The Gaussians of all pairs are joined.
+    /// Input views; empty: the first and the opposite view. Others have other angles than the person's own front. Of
+    /// more than two, each view and the next around the circle are a pair of photographs with known cameras and no
+    /// unseen sides. The Gaussians of all pairs are joined.
     pub inputs: Vec<usize>,
-    /// Offsets that are added to the input views, for angles other than the person's front.
-    pub turns: Vec<usize>,
     /// Side of the compared pictures in pixels, a divisor of the data set's side; 0: the data set's side.
     pub resolution: usize,
     /// Pictures are rendered this many times as large on each side, one of [`SUPERSAMPLING`], and shrunk.
@@ -106,7 +103,6 @@ impl Default for ViewsSection {
     fn default() -> Self {
         Self {
             inputs: Vec::new(),
-            turns: vec![0],
             resolution: 0,
             supersampling: 2,
             compared: Vec::new(),
@@ -131,27 +127,6 @@ impl ViewsSection {
     pub fn render_options(&self) -> RenderOptions {
         RenderOptions { antialiased: self.antialiased, ..self.preset.options() }
     }
-}
-
-/// The section `[model]`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ModelSection {
-    /// Weight file. `--weights` replaces it.
-    pub weights: Option<PathBuf>,
-    /// Overrides of the config that is stored with the weights, `section.key=value`.
-    pub set: Vec<String>,
-    /// Devices, as in `--device`; empty: the best device. The model runs on the first. Each further device is compared
-    /// with the first like an ablation.
-    pub devices: Vec<String>,
-}
-
-/// A section `[groups.NAME]`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Group {
-    /// Names of subjects.
-    pub subjects: Vec<String>,
 }
 
 /// Region in which pictures are compared.
@@ -187,8 +162,6 @@ pub struct MetricsSection {
     pub lpips: PathBuf,
     /// Whether the Chamfer distance of the Gaussians' centres and the cosine of normals are measured.
     pub geometry: bool,
-    /// Least opacity of Gaussians that belong to the surface.
-    pub opaque: f32,
     /// Whether the mesh of `snapsnap mesh` is measured too, which takes seconds per person.
     pub mesh: bool,
     /// Alignment of models and meshes with the ground truth before anything is measured. Baselines stay as they are.
@@ -202,7 +175,6 @@ impl Default for MetricsSection {
             protocols: vec![Protocol::Paper, Protocol::Masked],
             lpips: "weights".into(),
             geometry: true,
-            opaque: 0.5,
             mesh: false,
             align: Align::None,
         }
@@ -242,38 +214,29 @@ impl Default for ReportSection {
 }
 
 impl EvalConfig {
-    /// The model under test, and its variants on the further `devices` and in `[ablations]`, with their names in
-    /// reports.
-    pub fn variants(&self, devices: &[String]) -> Vec<(String, Variant)> {
+    /// The model under test on `device`, and its variants in `[ablations]`, with their names in reports.
+    pub fn variants(&self, device: &str) -> Vec<(String, Variant)> {
         let model = Variant {
-            weights: self.model.weights.clone(),
-            set: self.model.set.clone(),
-            device: devices.first().cloned(),
+            device: Some(device.to_owned()),
             inputs: Some(self.views.inputs.clone()),
-            photographs: Some(self.photographs),
-            ..Variant::default()
+            photographs: self.model.photographs.or(Some(self.photographs)),
+            ..self.model.clone()
         };
-        let on = |name: &String| Variant { device: Some(name.clone()), ..Variant::default() };
-        let others = devices.iter().skip(1).map(|name| (on_device(name), on(name)));
-        let others = others.chain(self.ablations.clone()).map(|(name, other)| (name, other.over(&model)));
+        let others = self.ablations.clone().into_iter().map(|(name, other)| (name, other.over(&model)));
         [("model".to_owned(), model.clone())].into_iter().chain(others).collect()
     }
 }
 
-/// Name of the model on another device in reports.
-fn on_device(name: &str) -> String {
-    format!("on {name}")
-}
-
 impl Schema for EvalConfig {
     fn refusal(&self) -> Option<(String, String)> {
-        let of_ablation = |(name, ablation): (&String, &Variant)| {
+        let of_variant = |(section, variant): (String, &Variant)| {
             let of_benchmarks = |key| (key, "only settings of `snapsnap bench` have this key".to_owned());
-            let problem = ablation.refusal().or_else(|| ablation.key_of_benchmarks().map(of_benchmarks));
-            problem.map(|(key, message)| (format!("ablations.{name}.{key}"), message))
+            let problem = variant.refusal().or_else(|| variant.key_of_benchmarks().map(of_benchmarks));
+            problem.map(|(key, message)| (format!("{section}.{key}"), message))
         };
+        let ablations = self.ablations.iter().map(|(name, ablation)| (format!("ablations.{name}"), ablation));
         let problem = self.problem().map(|(key, message)| (key.to_owned(), message));
-        problem.or_else(|| self.ablations.iter().find_map(of_ablation))
+        problem.or_else(|| ablations.chain([("model".into(), &self.model)]).find_map(of_variant))
     }
 }
 
@@ -281,20 +244,13 @@ impl EvalConfig {
     fn problem(&self) -> Option<(&'static str, String)> {
         /// Names that have another meaning in reports.
         const TAKEN: [&str; 4] = ["model", "against", "billboard", "true_points"];
-        let Self { views, metrics, report, ablations, model, .. } = self;
-        let devices = model.devices.iter().map(|name| on_device(name));
-        let mut names: Vec<String> = ablations.keys().cloned().chain(devices).collect();
-        names.sort_unstable();
-        if let Some(name) = names.iter().find(|name| TAKEN.contains(&name.as_str())) {
+        let Self { views, metrics, report, ablations, .. } = self;
+        if let Some(name) = ablations.keys().find(|name| TAKEN.contains(&name.as_str())) {
             let message = format!("`{name}` has another meaning in reports: choose another name");
             return Some(("ablations", message));
         }
-        if let Some(pair) = names.windows(2).find(|pair| pair[0] == pair[1]) {
-            return Some(("ablations", format!("`{}` is the name of two ablations or devices", pair[0])));
-        }
-        if names.iter().chain(self.groups.keys()).any(|name| name.contains(char::is_control)) {
-            let message = "the name of an ablation, a device or a group has control characters";
-            return Some(("ablations", message.into()));
+        if ablations.keys().any(|name| name.contains(char::is_control)) {
+            return Some(("ablations", "the name of an ablation has control characters".into()));
         }
         if let Some((key, message)) = self.photographs.problem() {
             return Some(("photographs", format!("`{key}` {message}")));
@@ -303,9 +259,7 @@ impl EvalConfig {
             return Some(("views.inputs", problem));
         }
         let problems = [
-            ("views.turns", names_twice(&views.turns), "names a view twice"),
             ("views.compared", names_twice(&views.compared), "names a view twice"),
-            ("views.turns", !(1..=64).contains(&views.turns.len()), "must have 1 to 64 entries"),
             ("views.supersampling", !SUPERSAMPLING.contains(&views.supersampling), "must be 1, 2 or 4"),
             (
                 "metrics.protocols",
@@ -313,7 +267,6 @@ impl EvalConfig {
                 "is empty, must name `paper`, `masked` or both",
             ),
             ("metrics.protocols", names_twice(&metrics.protocols), "names a protocol twice"),
-            ("metrics.opaque", !(0.0..=1.0).contains(&metrics.opaque), "must be 0 to 1"),
             (
                 "report.people",
                 report.people > 5 || report.degrees.len() > 12,

@@ -177,7 +177,7 @@ fn aligned(
     front: &Camera,
 ) -> Result<[f64; 3], EvalError> {
     let truth = truth.ok_or_else(|| EvalError::Message("there is no ground truth to align with".into()))?;
-    let centres = opaque_centres(gaussians, metrics.opaque, ALIGNED)?;
+    let centres = opaque_centres(gaussians, ALIGNED)?;
     let motion = icp(&centres, &thinned(&truth.points, 10 * ALIGNED), metrics.align == Align::Similarity)?;
     *gaussians = gaussians.clone().scaled(motion.scale).transformed(&motion.rigid());
     let (to_world, to_front) = (front.world_to_camera.inverse(), front.world_to_camera);

@@ -12,7 +12,7 @@ use snapsnap_mesh::mesh::Mesh;
 
 use super::config::EvalConfig;
 use super::person::People;
-use super::shared::{LeftOut, missing, name_of};
+use super::shared::{LeftOut, everybody, missing, name_of};
 use super::surface::truth as truth_of;
 use crate::EvalError;
 use crate::geometry::{ALIGNED, Align, chamfer, icp, point_to_surface, sampled, thinned};
@@ -51,15 +51,13 @@ pub fn evaluate_meshes(
     folder: &Path,
     progress: &dyn Fn(usize, usize),
 ) -> (Vec<MeshFigures>, Vec<LeftOut>) {
-    let total = sets.iter().map(|set| set.chosen.len()).sum();
+    let total = everybody(sets).count();
     let (mut figures, mut left_out) = (Vec::new(), Vec::new());
-    let people = sets.iter().flat_map(|set| set.chosen.iter().map(move |row| (set, *row)));
-    for (done, (people, row)) in people.enumerate() {
+    for (done, (people, row)) in everybody(sets).enumerate() {
         let name = name_of(sets, people, row);
         let own = people.test.name(row);
         // A file needs the data set's name only if several data sets have a person of this name.
-        let is_in = |set: &&People| set.chosen.iter().any(|row| set.test.name(*row) == own);
-        let is_alone = sets.iter().filter(is_in).count() == 1;
+        let is_alone = everybody(sets).filter(|(set, row)| set.test.name(*row) == own).count() == 1;
         let names: Vec<&str> = [&*name].into_iter().chain(is_alone.then_some(own)).collect();
         match one(config, people, row, &names, folder) {
             Ok(found) => figures.push(found),

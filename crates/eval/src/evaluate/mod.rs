@@ -33,7 +33,7 @@ use contest::Shown;
 pub use contest::{Contestant, Kind};
 use person::People;
 pub use shared::{LeftOut, rendered};
-use shared::{at_once, missing, name_of};
+use shared::{at_once, everybody, missing, name_of};
 pub use surface::{Surface, Truth, truth};
 
 /// Scores of one view of a person.
@@ -41,8 +41,6 @@ pub use surface::{Surface, Truth, truth};
 pub struct Row {
     /// Index in [`Outcome::people`].
     pub person: usize,
-    /// Offset that was added to the input views.
-    pub turn: usize,
     /// The view.
     pub view: usize,
     /// Degrees from the first photograph's camera, around the person.
@@ -62,21 +60,21 @@ pub struct Judged {
     pub kind: Kind,
     /// Scores of the views.
     pub rows: Vec<Row>,
-    /// Errors of the predicted points, of all people and turns.
+    /// Errors of the predicted points, of all people.
     pub points: Vec<PointError>,
-    /// Errors of the photographs' points on head, hands and feet, of all people and turns.
+    /// Errors of the photographs' points on head, hands and feet, of all people.
     pub parts: Vec<PartError>,
-    /// The Gaussians as a surface, per person and turn.
-    pub surface: Vec<(usize, Surface)>,
-    /// The mesh made of the Gaussians, per person and turn.
-    pub mesh: Vec<(usize, Surface)>,
-    /// Mean overlap of the cut-outs and the true masks, per person and turn.
-    pub masks: Vec<(usize, f64)>,
-    /// From the photographs to the Gaussians, per person and turn.
+    /// The Gaussians as a surface, per person.
+    pub surface: Vec<Surface>,
+    /// The mesh made of the Gaussians, per person.
+    pub mesh: Vec<Surface>,
+    /// Mean overlap of the cut-outs and the true masks, per person.
+    pub masks: Vec<f64>,
+    /// From the photographs to the Gaussians, per person.
     pub times: Vec<Duration>,
-    /// Number of Gaussians, per person and turn.
+    /// Number of Gaussians, per person.
     pub gaussians: Vec<usize>,
-    /// Rotation in degrees, shift of the middle in cm and scale of the alignment, per person and turn.
+    /// Rotation in degrees, shift of the middle in cm and scale of the alignment, per person.
     pub aligned: Vec<[f64; 3]>,
 }
 
@@ -113,7 +111,7 @@ pub fn evaluate(
     lpips: Option<&Lpips>,
     progress: &dyn Fn(usize, usize),
 ) -> Outcome {
-    let total = sets.iter().map(|set| set.chosen.len()).sum();
+    let total = everybody(sets).count();
     let mut sides: Vec<String> = sets.iter().map(|set| format!("{}²", set.side(&config.views))).collect();
     sides.dedup();
     let pictures =
@@ -125,35 +123,18 @@ pub fn evaluate(
     };
     let judged = contestants.iter().map(named).collect();
     let mut outcome = Outcome { people: Vec::new(), judged, left_out: Vec::new(), pictures };
-    for people in sets {
-        for &row in &people.chosen {
-            let person = outcome.people.len();
-            outcome.people.push(name_of(sets, people, row));
-            let at = Place { config, contestants, lpips, people, row, person };
-            let metrics = &config.metrics;
-            let is_measured = metrics.geometry || metrics.mesh || metrics.align != Align::None;
-            let truth = is_measured.then(|| truth(people, row));
-            let truth = truth.and_then(|truth| at.kept(&mut outcome, ", geometry", truth));
-            for &turn in &config.views.turns {
-                at.evaluate(turn, truth.as_ref(), &mut outcome);
-            }
-            progress(person + 1, total);
-        }
-    }
-    for (key, group) in &config.groups {
-        for name in &group.subjects {
-            if !outcome.people.iter().any(|person| is_named(person, name)) {
-                outcome.left_out.push(LeftOut::new(name, format!("groups.{key}: no person has this name")));
-            }
-        }
+    for (person, (people, row)) in everybody(sets).enumerate() {
+        outcome.people.push(name_of(sets, people, row));
+        let at = Place { config, contestants, lpips, people, row, person };
+        let metrics = &config.metrics;
+        let is_measured = metrics.geometry || metrics.mesh || metrics.align != Align::None;
+        let truth = is_measured.then(|| truth(people, row));
+        let truth = truth.and_then(|truth| at.kept(&mut outcome, ", geometry", truth));
+        at.evaluate(truth.as_ref(), &mut outcome);
+        progress(person + 1, total);
     }
     outcome.left_out.extend(missing(config, sets));
     outcome
-}
-
-/// Whether a person has this name, with or without the data set's name before it.
-pub(crate) fn is_named(person: &str, name: &str) -> bool {
-    person == name || person.rsplit('/').next() == Some(name)
 }
 
 /// A person and the contestants.
@@ -183,10 +164,10 @@ impl Place<'_> {
         result.map_err(|e| self.left_out(outcome, what, e)).ok()
     }
 
-    /// Evaluates all contestants with the input views of one turn.
-    fn evaluate(&self, turn: usize, truth: Option<&Truth>, outcome: &mut Outcome) {
+    /// Evaluates all contestants.
+    fn evaluate(&self, truth: Option<&Truth>, outcome: &mut Outcome) {
         let Self { config, contestants, people, row, person, .. } = *self;
-        let (inputs, side) = (people.inputs(&config.views, turn), people.side(&config.views));
+        let (inputs, side) = (people.inputs(&config.views), people.side(&config.views));
         let item = people.item(row, &inputs, &PhotographChanges::default());
         let Some(item) = self.kept(outcome, "", item) else { return };
         let mut shown = Vec::new();
@@ -223,7 +204,7 @@ impl Place<'_> {
             for (i, scores) in scored.unwrap_or_default() {
                 let what = format!(", {}, view {view}", contestants[i].name());
                 if let Some((scores, traces)) = self.kept(outcome, &what, scores) {
-                    outcome.judged[i].rows.push(Row { person, turn, view, degrees, scores, traces });
+                    outcome.judged[i].rows.push(Row { person, view, degrees, scores, traces });
                 }
             }
         }
@@ -231,7 +212,7 @@ impl Place<'_> {
 
     /// Records all measurements of a contestant except the scores of pictures.
     fn measure(&self, i: usize, made: &Shown, truth: Option<&Truth>, outcome: &mut Outcome) {
-        let Self { config, person, .. } = *self;
+        let Self { config, .. } = *self;
         let name = format!(", {}", self.contestants[i].name());
         let points = self.kept(outcome, &format!("{name}, points"), made.points.clone());
         if made.lost > 0 {
@@ -243,20 +224,20 @@ impl Place<'_> {
             judged.points.extend(points);
             judged.parts.extend(parts);
         }
-        judged.masks.extend(made.masks.map(|overlap| (person, overlap)));
+        judged.masks.extend(made.masks);
         judged.times.extend(made.time);
         judged.gaussians.push(made.gaussians.len());
         judged.aligned.extend(made.aligned);
         let is_baseline = judged.kind == Kind::Baseline;
         let (Some(truth), gaussians) = (truth, &made.gaussians) else { return };
         if config.metrics.geometry {
-            let surface = Surface::of_gaussians(gaussians, truth, config.metrics.opaque);
+            let surface = Surface::of_gaussians(gaussians, truth);
             let surface = self.kept(outcome, &format!("{name}, geometry"), surface);
-            outcome.judged[i].surface.extend(surface.map(|surface| (person, surface)));
+            outcome.judged[i].surface.extend(surface);
         }
         if config.metrics.mesh && !is_baseline {
             let mesh = self.kept(outcome, &format!("{name}, mesh"), Surface::of_mesh(gaussians, truth));
-            outcome.judged[i].mesh.extend(mesh.map(|mesh| (person, mesh)));
+            outcome.judged[i].mesh.extend(mesh);
         }
     }
 
@@ -271,8 +252,6 @@ impl Place<'_> {
         let side = people.side(&config.views);
         let (target, mask) = people.target(self.row, view, side)?;
         let masked = || Region::masked(&mask, [side, side], margin(side));
-        let has_palette = shown.iter().flatten().any(|shown| shown.palette.is_some());
-        let around = has_palette.then(masked).transpose()?;
         let region = |protocol: &Protocol| match protocol {
             Protocol::Paper => Region::paper(&target),
             Protocol::Masked => masked(),
@@ -287,8 +266,8 @@ impl Place<'_> {
                 let views = self.contestants[i].views(&config.views);
                 let image = rendered(&shown.gaussians, camera, side, &views)?;
                 let scores = regions.iter().map(|region| score(&image, region)).collect::<Result<_, _>>()?;
-                let palette = shown.palette.as_ref().zip(around.as_ref());
-                let traces = palette.map(|(palette, region)| palette.traces(&image, &target, &mask, region));
+                let palette = shown.palette.as_ref();
+                let traces = palette.map(|palette| palette.traces(&image, &target, &mask)).transpose()?;
                 Ok((scores, traces))
             };
             Some((i, judged()))
@@ -308,8 +287,7 @@ pub fn sheet(
     contestant: &Contestant,
     persons: &[usize],
 ) -> (Option<RgbImage>, Vec<LeftOut>) {
-    let places: Vec<(&People, usize)> =
-        sets.iter().flat_map(|set| set.chosen.iter().map(move |row| (set, *row))).collect();
+    let places: Vec<(&People, usize)> = everybody(sets).collect();
     let (mut rows, mut left_out) = (Vec::new(), Vec::new());
     for (people, row) in persons.iter().map(|person| places[*person]) {
         match pictures(config, people, row, contestant) {
@@ -331,7 +309,7 @@ fn pictures(
     row: usize,
     contestant: &Contestant,
 ) -> Result<Vec<RgbImage>, EvalError> {
-    let inputs = people.inputs(&config.views, config.views.turns[0]);
+    let inputs = people.inputs(&config.views);
     let item = people.item(row, &inputs, &PhotographChanges::default())?;
     let side = people.side(&config.views);
     let truth = (config.metrics.align != Align::None).then(|| truth(people, row)).transpose()?;

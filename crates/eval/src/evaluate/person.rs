@@ -50,8 +50,7 @@ impl People {
         if views.inputs.is_empty() && !count.is_multiple_of(2) {
             return Err(wrong(&format!("has {count} views, none opposite the first: set `views.inputs`")));
         }
-        let lists = [("inputs", &views.inputs), ("turns", &views.turns), ("compared", &views.compared)];
-        for (key, list) in lists {
+        for (key, list) in [("inputs", &views.inputs), ("compared", &views.compared)] {
             if let Some(view) = list.iter().find(|view| **view >= count) {
                 return Err(wrong(&format!("has no view {view}, of {count}, which `views.{key}` names")));
             }
@@ -74,11 +73,9 @@ impl People {
         self.folder.description().views
     }
 
-    /// The input views, each moved on by `turn` views.
-    pub fn inputs(&self, views: &ViewsSection, turn: usize) -> Vec<usize> {
-        let count = self.views();
-        let first = if views.inputs.is_empty() { vec![0, count / 2] } else { views.inputs.clone() };
-        first.into_iter().map(|view| (view + turn) % count).collect()
+    /// The input views.
+    pub fn inputs(&self, views: &ViewsSection) -> Vec<usize> {
+        if views.inputs.is_empty() { vec![0, self.views() / 2] } else { views.inputs.clone() }
     }
 
     /// Side of the compared pictures.

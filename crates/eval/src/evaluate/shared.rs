@@ -25,15 +25,18 @@ impl LeftOut {
     }
 }
 
+/// The evaluated people of all data sets, with their rows in them.
+pub(super) fn everybody(sets: &[People]) -> impl Iterator<Item = (&People, usize)> {
+    sets.iter().flat_map(|set| set.chosen.iter().map(move |row| (set, *row)))
+}
+
 /// The people whom the config names and no data set has.
 pub(super) fn missing(config: &EvalConfig, sets: &[People]) -> Vec<LeftOut> {
-    let is_missing = |name: &&String| {
-        !sets.iter().any(|set| set.chosen.iter().any(|row| set.test.name(*row) == name.as_str()))
-    };
+    let is_missing = |name: &&String| !everybody(sets).any(|(set, row)| set.test.name(row) == name.as_str());
     let missing = config.data.only.iter().filter(is_missing);
     let why = "data.only: no data set has this person, or not among its first `data.subjects`";
     let mut left_out: Vec<LeftOut> = missing.map(|name| LeftOut::new(name, why)).collect();
-    if left_out.is_empty() && sets.iter().all(|set| set.chosen.is_empty()) {
+    if left_out.is_empty() && everybody(sets).next().is_none() {
         left_out.push(LeftOut::new("everything", "the data sets have no people"));
     }
     left_out

@@ -147,13 +147,13 @@ impl Truth {
 }
 
 impl Surface {
-    /// Compares Gaussians (world frame) with the truth: the centres of Gaussians with an opacity of at least `opaque`,
-    /// and the rendered depths.
+    /// Compares Gaussians (world frame) with the truth: the centres of Gaussians that are at least half opaque, and the
+    /// rendered depths.
     ///
     /// # Errors
     /// [`EvalError`] if no Gaussian is so opaque.
-    pub fn of_gaussians(gaussians: &Gaussians, truth: &Truth, opaque: f32) -> Result<Self, EvalError> {
-        let centres = opaque_centres(gaussians, opaque, MOST)?;
+    pub fn of_gaussians(gaussians: &Gaussians, truth: &Truth) -> Result<Self, EvalError> {
+        let centres = opaque_centres(gaussians, MOST)?;
         let options = RenderOptions { depth: true, ..RenderOptions::inria() };
         let drawn = |view: &TrueView| {
             let rendered = render(gaussians, std::slice::from_ref(&view.camera), &options)?;

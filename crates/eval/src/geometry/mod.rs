@@ -24,6 +24,9 @@ pub use normals::{consistency, normals};
 /// Largest coordinate of a point in metres. The squares of larger coordinates overflow f32.
 const FARTHEST: f32 = 1e15;
 
+/// Least opacity of Gaussians that belong to the surface.
+pub(crate) const OPAQUE: f32 = 0.5;
+
 /// Mean distances between two sets of points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Chamfer {
@@ -40,20 +43,16 @@ impl Chamfer {
     }
 }
 
-/// Centres of at most `most` Gaussians with an opacity of at least `opaque`.
+/// Centres of at most `most` Gaussians with an opacity of at least [`OPAQUE`].
 ///
 /// # Errors
 /// [`EvalError::Message`] if no Gaussian is so opaque.
-pub(crate) fn opaque_centres(
-    gaussians: &Gaussians,
-    opaque: f32,
-    most: usize,
-) -> Result<Vec<[f32; 3]>, EvalError> {
+pub(crate) fn opaque_centres(gaussians: &Gaussians, most: usize) -> Result<Vec<[f32; 3]>, EvalError> {
     let means = host(gaussians.means.clone());
     let centres = means.as_chunks().0.iter().zip(host(gaussians.opacities.clone()));
-    let centres: Vec<[f32; 3]> = centres.filter(|(_, own)| *own >= opaque).map(|(p, _)| *p).collect();
+    let centres: Vec<[f32; 3]> = centres.filter(|(_, own)| *own >= OPAQUE).map(|(p, _)| *p).collect();
     if centres.is_empty() {
-        let message = format!("no Gaussian has an opacity of {opaque} or more (`metrics.opaque`)");
+        let message = format!("no Gaussian has an opacity of {OPAQUE} or more");
         return Err(EvalError::Message(message));
     }
     Ok(thinned(&centres, most))

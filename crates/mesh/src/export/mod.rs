@@ -1,8 +1,10 @@
-//! Export of meshes: OBJ with materials and textures, binary PLY with vertex colours, binary glTF 2.0.
+//! Export of meshes: OBJ with materials and textures, binary PLY with vertex colours, binary glTF 2.0, and STL and 3MF
+//! for printers.
 
 mod glb;
 mod obj;
 mod ply;
+mod print;
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -10,6 +12,7 @@ use std::sync::Arc;
 
 use image::{ImageFormat, RgbImage};
 use snapsnap_base::FileError;
+use snapsnap_base::file::write_whole;
 
 use crate::mesh::Mesh;
 
@@ -25,6 +28,10 @@ pub enum Kind {
     Ply,
     /// Binary glTF 2.0, textures inside.
     Glb,
+    /// Binary STL in millimetres, z up, without colours.
+    Stl,
+    /// 3MF in millimetres, z up, without colours.
+    ThreeMf,
 }
 
 impl Kind {
@@ -35,8 +42,15 @@ impl Kind {
             "obj" => Some(Self::Obj),
             "ply" => Some(Self::Ply),
             "glb" => Some(Self::Glb),
+            "stl" => Some(Self::Stl),
+            "3mf" => Some(Self::ThreeMf),
             _ => None,
         }
+    }
+
+    /// Whether the format can hold a texture.
+    pub fn has_texture(self) -> bool {
+        matches!(self, Self::Obj | Self::Glb)
     }
 }
 
@@ -49,6 +63,10 @@ pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
     match Kind::named(path) {
         Some(Kind::Obj) => obj::write(mesh, path),
         Some(Kind::Ply) => ply::write(mesh, path),
+        Some(Kind::Stl) => write_whole(path, |out| print::write_stl(mesh, out)).map_err(FileError::write(path)),
+        Some(Kind::ThreeMf) => {
+            write_whole(path, |out| print::write_3mf(mesh, out)).map_err(FileError::write(path))
+        }
         Some(Kind::Glb) | None => glb::write(mesh, path),
     }
 }

@@ -36,9 +36,7 @@ fn people_stand_upright_and_follow_their_names() {
         counts.insert(mesh.faces.len());
     }
     assert!(counts.len() >= 7, "people differ");
-    let (one, again) = (mesh("test/1"), mesh("test/1"));
-    assert_eq!(one.positions, again.positions);
-    assert_eq!(one.faces, again.faces);
+    let one = mesh("test/1");
     // Recorded numbers, the same on every machine. Only the mean has a tolerance: where two vertices of cloth are
     // equally near, machines may press skin against either.
     let texture = one.materials[0].texture.as_ref().expect("has a texture");

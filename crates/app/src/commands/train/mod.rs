@@ -4,7 +4,6 @@ mod folder;
 mod report;
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -86,16 +85,16 @@ struct Plan<'a> {
     begun: Option<(&'a Path, TrainConfig)>,
 }
 
-pub fn stage1(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub fn stage1(arguments: &Arguments) -> Result<u8, Failure> {
     among_ranks(|ranks| points(arguments, ranks))
 }
 
-pub fn stage2(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub fn stage2(arguments: &Arguments) -> Result<u8, Failure> {
     among_ranks(|ranks| humans(arguments, ranks))
 }
 
 /// Runs `work` as one of the ranks of MPI, if a launcher started several. The failure of one rank ends all ranks.
-fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result<ExitCode, Failure> {
+fn among_ranks(work: impl FnOnce(&Ranks) -> Result<u8, Failure>) -> Result<u8, Failure> {
     let ranks = Ranks::join().map_err(Failure::Input)?;
     if ranks.size == 1 {
         return work(&ranks);
@@ -121,7 +120,7 @@ fn among_ranks(work: impl FnOnce(&Ranks) -> Result<ExitCode, Failure>) -> Result
     Err(failure)
 }
 
-fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
+fn points(arguments: &Arguments, ranks: &Ranks) -> Result<u8, Failure> {
     let mut plan = Plan::new(arguments, ranks)?;
     plan.keep_start();
     if plan.config.stage1.only_details && plan.begun.is_none() && plan.config.training.weights.is_none() {
@@ -142,7 +141,7 @@ fn points(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
     })
 }
 
-fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<ExitCode, Failure> {
+fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<u8, Failure> {
     let mut plan = Plan::new(arguments, ranks)?;
     let joint = plan.config.stage2.points_weight > 0.0;
     if joint {
@@ -250,7 +249,7 @@ impl<'a> Plan<'a> {
         &self,
         task: &T,
         networks: impl Fn(&Device) -> Result<Networks, Failure> + Sync,
-    ) -> Result<ExitCode, Failure> {
+    ) -> Result<u8, Failure> {
         let (tracked, ranks) = (&self.device, self.ranks);
         if self.arguments.dry_run {
             return run::on_best_thread(tracked, || {
@@ -258,7 +257,7 @@ impl<'a> Plan<'a> {
                 if ranks.is_first() {
                     report::rehearsed(&self.config, tracked, rehearsal);
                 }
-                Ok(ExitCode::SUCCESS)
+                Ok(0)
             });
         }
         let path = self.arguments.output.as_deref().expect("required by clap");
@@ -281,7 +280,7 @@ impl<'a> Plan<'a> {
         drop(reporter);
         self.summarise(T::STAGE, path, &outcome, start.elapsed());
         let is_cut = !outcome.finished && ranks.gather(&interrupt::was_terminated()).contains(&true);
-        Ok(if is_cut { ExitCode::from(UNFINISHED) } else { ExitCode::SUCCESS })
+        Ok(if is_cut { UNFINISHED } else { 0 })
     }
 
     /// Prints the outcome of a session and the next commands.

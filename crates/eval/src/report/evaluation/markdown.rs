@@ -5,9 +5,8 @@ use std::fmt::Write;
 use super::{
     Cost, Evaluation, FIGURES, alignment_means, part_means, point_means, seconds, surface_intervals,
 };
-use crate::evaluate::config::Protocol;
 use crate::evaluate::{Judged, Kind, Surface, by_person};
-use crate::geometry::Align;
+use crate::geometry::{Align, OPAQUE};
 use crate::parts::PARTS;
 use crate::points::VIEWS;
 use crate::report::{cell, escaped, left_out_markdown, table_markdown};
@@ -47,18 +46,6 @@ impl Evaluation<'_> {
             }
         }
         self.photographs_markdown(&mut text);
-        for (name, group) in &self.config.groups {
-            let row = |(judged, (i, protocol)): (&Judged, (usize, Protocol))| {
-                let people = self.of_group(group, judged, i);
-                let counts = [protocol.name().into(), people.len().to_string()];
-                scores(&judged.name, counts, &Self::overall(&people))
-            };
-            let of_contestant = |judged| self.protocols().map(move |protocol| (judged, protocol));
-            let rows = self.outcome.judged.iter().flat_map(of_contestant);
-            let header = [&["", "protocol", "people"][..], &TITLES].concat();
-            let table = table_markdown(&header, rows.map(row));
-            let _ = writeln!(text, "## Group `{}`\n\n{table}", escaped(name));
-        }
         self.geometry_markdown(&mut text);
         for picture in pictures {
             let _ = writeln!(text, "![{picture}]({picture})\n");
@@ -166,7 +153,7 @@ impl Evaluation<'_> {
         let meshes = made.iter().map(|judged| (format!("{}, mesh", judged.name), &judged.mesh));
         let surfaces: Vec<_> = centres.chain(meshes).filter(|(_, found)| !found.is_empty()).collect();
         if !surfaces.is_empty() {
-            let row = |(name, found): (String, &Vec<(usize, Surface)>)| {
+            let row = |(name, found): (String, &Vec<Surface>)| {
                 let [forward, backward, mean, normals, open] = surface_intervals(found);
                 let distances = [forward, backward, mean].map(|distance| cell(distance, 1.0, 2));
                 [vec![name], distances.into(), vec![cell(normals, 1.0, 3), cell(open, 100.0, 2)]].concat()
@@ -175,11 +162,10 @@ impl Evaluation<'_> {
             let _ = writeln!(
                 text,
                 "## Surface\n\nDistances in cm between the ground-truth points of all views and the centres of the \
-                 Gaussians with an opacity of at least {}, or points drawn from the meshes of the Gaussians; normals: mean cosine from \
+                 Gaussians with an opacity of at least {OPAQUE}, or points drawn from the meshes of the Gaussians; normals: mean cosine from \
                  the views nearest to 0, 90, 180 and 270°, in maps of 256² at most; open: share of the person's pixels that are covered by \
                  less than 90 % or show a surface more than 6 cm behind the true one, from the views nearest to every 45°, without the rim \
                  and without steps of the true depth.\n\n{}",
-                self.config.metrics.opaque,
                 table_markdown(&header, surfaces.into_iter().map(row))
             );
         }

@@ -10,8 +10,8 @@ use serde_json::{Value, json};
 use snapsnap_base::plot::{Axes, Series, svg};
 
 use super::{Header, number, table};
-use crate::evaluate::config::{EvalConfig, Group, Protocol};
-use crate::evaluate::{Judged, Kind, Outcome, Row, Surface, by_person, is_named};
+use crate::evaluate::config::{EvalConfig, Protocol};
+use crate::evaluate::{Judged, Kind, Outcome, Row, Surface, by_person};
 use crate::foreign::Traces;
 use crate::parts::{PARTS, PartError};
 use crate::points::{PointError, VIEWS};
@@ -66,20 +66,19 @@ impl Evaluation<'_> {
 
     /// Intervals over people: overlap of masks; shares of foreign colour and beside the person, in views from the sides.
     fn photographs(judged: &Judged) -> [Option<Interval>; 3] {
-        let traces = |of: fn(&Traces) -> f64| -> Vec<(usize, f64)> {
-            of_sides(judged).filter_map(|row| Some((row.person, of(row.traces.as_ref()?)))).collect()
-        };
-        let over = |values: &[(usize, f64)]| {
+        let over = |of: fn(&Traces) -> f64| {
             let mut people: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
-            values.iter().for_each(|(person, value)| people.entry(*person).or_default().push(*value));
+            for row in of_sides(judged) {
+                people.entry(row.person).or_default().extend(row.traces.as_ref().map(of));
+            }
             interval(&people.values().filter_map(|values| mean(values)).collect::<Vec<_>>())
         };
-        [over(&judged.masks), over(&traces(|traces| traces.foreign)), over(&traces(|traces| traces.beside))]
+        [interval(&judged.masks), over(|traces| traces.foreign), over(|traces| traces.beside)]
     }
 
     /// Figures of `one` minus figures of `other`, person by person, over the views that both have.
     fn difference(one: &Judged, other: &Judged, protocol: usize) -> [Option<Interval>; 3] {
-        let place = |row: &Row| (row.person, row.turn, row.view);
+        let place = |row: &Row| (row.person, row.view);
         let both: BTreeSet<_> = one.rows.iter().map(place).collect();
         let both: BTreeSet<_> = other.rows.iter().map(place).filter(|row| both.contains(row)).collect();
         let [one, other] = [one, other]
@@ -153,19 +152,6 @@ impl Evaluation<'_> {
         report["geometry_cm"] = self.model().map_or(Value::Null, |model| geometry_json(&model.surface));
         report["mesh_cm"] = self.model().map_or(Value::Null, |model| geometry_json(&model.mesh));
         report["seconds"] = self.model().map_or(Value::Null, seconds_json);
-        let group = |(name, group): (&String, &Group)| {
-            let of_contestant = |judged: &Judged| {
-                let value = self.by_protocol(|protocol| {
-                    let people = self.of_group(group, judged, protocol);
-                    let mut value = figures(&Self::overall(&people));
-                    value["people"] = json!(people.len());
-                    value
-                });
-                (judged.name.clone(), value)
-            };
-            (name.clone(), self.outcome.judged.iter().map(of_contestant).collect::<Value>())
-        };
-        report["groups"] = self.config.groups.iter().map(group).collect();
         report["lpips"] = json!(self.lpips);
         report["cost"] = json!(self.cost);
         report["left_out"] = json!(self.outcome.left_out);
@@ -188,44 +174,18 @@ impl Evaluation<'_> {
         })
     }
 
-    /// Mean score of each person of a group.
-    fn of_group(&self, group: &Group, judged: &Judged, protocol: usize) -> BTreeMap<usize, Score> {
-        let mut people = by_person(&judged.rows, protocol);
-        people.retain(|person, _| {
-            group.subjects.iter().any(|subject| is_named(&self.outcome.people[*person], subject))
-        });
-        people
-    }
-
     /// `views.csv`: a row per contestant, person, view and protocol.
     pub fn views_csv(&self) -> String {
-        const HEADER: [&str; 9] =
-            ["contestant", "protocol", "subject", "turn", "view", "degrees", "psnr", "ssim", "lpips"];
+        const HEADER: [&str; 8] =
+            ["contestant", "protocol", "subject", "view", "degrees", "psnr", "ssim", "lpips"];
         let mut rows = Vec::new();
         for (judged, row) in self.outcome.judged.iter().flat_map(|j| j.rows.iter().map(move |row| (j, row))) {
             for ((_, protocol), score) in self.protocols().zip(&row.scores) {
                 let person = self.outcome.people[row.person].clone();
                 let mut cells = vec![judged.name.clone(), protocol.name().into(), person];
-                cells.extend([row.turn.to_string(), row.view.to_string(), format!("{:.2}", row.degrees)]);
-                cells.extend(numbers(score));
+                cells.extend([row.view.to_string(), format!("{:.2}", row.degrees)]);
+                cells.extend(FIGURES.map(|(_, of, ..)| number(of(score))));
                 rows.push(cells);
-            }
-        }
-        table(&HEADER, rows.into_iter())
-    }
-
-    /// `subjects.csv`: a row per contestant, person and protocol.
-    pub fn subjects_csv(&self) -> String {
-        const HEADER: [&str; 6] = ["contestant", "protocol", "subject", "psnr", "ssim", "lpips"];
-        let mut rows = Vec::new();
-        for judged in &self.outcome.judged {
-            for (i, protocol) in self.protocols() {
-                for (person, score) in by_person(&judged.rows, i) {
-                    let person = self.outcome.people[person].clone();
-                    let mut cells = vec![judged.name.clone(), protocol.name().into(), person];
-                    cells.extend(numbers(&score));
-                    rows.push(cells);
-                }
             }
         }
         table(&HEADER, rows.into_iter())
@@ -278,14 +238,14 @@ fn figures(intervals: &[Option<Interval>; 3]) -> Value {
     FIGURES.iter().zip(intervals).map(|((name, ..), interval)| (*name, json!(interval))).collect()
 }
 
-/// Means over people and turns: distance in mm, distance after centring in mm, share of missed points.
+/// Means over people: distance in mm, distance after centring in mm, share of missed points.
 fn point_means(judged: &Judged, view: usize) -> Option<[f64; 3]> {
     let errors = || judged.points.iter().filter(|error| error.view == view);
     let over = |of: fn(&PointError) -> f64| mean(&errors().map(of).collect::<Vec<_>>());
     Some([over(|e| 1e3 * e.mean)?, over(|e| 1e3 * e.centred)?, over(|e| e.missed)?])
 }
 
-/// Means over people, turns and photographs: distance in mm, degrees between normals, share of far points in per cent.
+/// Means over people and photographs: distance in mm, degrees between normals, share of far points in per cent.
 fn part_means(judged: &Judged, part: usize) -> [Option<f64>; 3] {
     let errors = || judged.parts.iter().filter(|error| error.part == part);
     let over = |of: fn(&PartError) -> Option<f64>| mean(&errors().filter_map(of).collect::<Vec<_>>());
@@ -300,7 +260,7 @@ fn parts_json(judged: &Judged) -> Value {
     PARTS.iter().enumerate().map(part).collect()
 }
 
-/// Means over people and turns: degrees, centimetres, scale.
+/// Means over people: degrees, centimetres, scale.
 fn alignment_means(judged: &Judged) -> Option<[f64; 3]> {
     let over = |i: usize| mean(&judged.aligned.iter().map(|figures| figures[i]).collect::<Vec<_>>());
     Some([over(0)?, over(1)?, over(2)?])
@@ -316,14 +276,9 @@ fn points_json(judged: &Judged) -> Value {
 }
 
 /// Means over people: distances in cm to the truth, from the truth and both; cosine of normals; open share.
-fn surface_intervals(surfaces: &[(usize, Surface)]) -> [Option<Interval>; 5] {
-    let over = |of: fn(&Surface) -> Option<f64>| {
-        let of_person = |turns: &[(usize, Surface)]| {
-            mean(&turns.iter().filter_map(|(_, surface)| of(surface)).collect::<Vec<_>>())
-        };
-        let people = surfaces.chunk_by(|(person, _), (next, _)| person == next);
-        interval(&people.filter_map(of_person).collect::<Vec<_>>())
-    };
+fn surface_intervals(surfaces: &[Surface]) -> [Option<Interval>; 5] {
+    let over =
+        |of: fn(&Surface) -> Option<f64>| interval(&surfaces.iter().filter_map(of).collect::<Vec<_>>());
     [
         over(|s| Some(1e2 * s.chamfer.forward)),
         over(|s| Some(1e2 * s.chamfer.backward)),
@@ -333,7 +288,7 @@ fn surface_intervals(surfaces: &[(usize, Surface)]) -> [Option<Interval>; 5] {
     ]
 }
 
-fn geometry_json(surfaces: &[(usize, Surface)]) -> Value {
+fn geometry_json(surfaces: &[Surface]) -> Value {
     let [forward, backward, mean, normals, open] = surface_intervals(surfaces);
     json!({
         "to_truth": forward,
@@ -352,9 +307,4 @@ fn seconds(judged: &Judged) -> Option<[f64; 2]> {
 
 fn seconds_json(judged: &Judged) -> Value {
     json!(seconds(judged).map(|[p50, p95]| json!({ "p50": p50, "p95": p95 })))
-}
-
-/// The cells of a score in a CSV table; absent figures are empty.
-fn numbers(score: &Score) -> [String; 3] {
-    FIGURES.map(|(_, of, ..)| number(of(score)))
 }

@@ -1,0 +1,134 @@
+//! The differentiable rasteriser.
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use burn::tensor::{Tensor, TensorData};
+use pyo3::exceptions::PyRuntimeError;
+use pyo3::prelude::*;
+use pyo3::pybacked::PyBackedBytes;
+use pyo3::types::PyByteArray;
+use snapsnap_ops::host;
+use snapsnap_splat::{Gaussians, Preset, Rendered, render};
+
+use crate::arrays::{Arrays, bytes, cameras, floats, gaussians, tensor};
+use crate::work::{run, unsuitable};
+
+/// What the backward pass of a render needs. It is used once.
+#[pyclass(frozen)]
+pub struct Tape(Arc<Mutex<Option<Forward>>>);
+
+struct Forward {
+    inputs: Gaussians,
+    background: Option<Tensor<1>>,
+    rendered: Rendered,
+}
+
+/// Gradients of means, rotations, scales, opacities, colours and background.
+type Gradients<'py> = [Option<Bound<'py, PyByteArray>>; 6];
+
+#[pymethods]
+impl Tape {
+    /// Gradients of the sum of all outputs, each multiplied by its gradient.
+    fn backward<'py>(
+        &self,
+        py: Python<'py>,
+        color: PyBackedBytes,
+        alpha: PyBackedBytes,
+        depth: Option<PyBackedBytes>,
+    ) -> PyResult<Gradients<'py>> {
+        let forward = self.0.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let forward = forward.ok_or_else(|| PyRuntimeError::new_err("the gradients were taken already"))?;
+        let gradients = run(py, move |_| {
+            let Forward { inputs, background, rendered } = forward;
+            let weighed = |output: Tensor<1>, gradient: &[u8]| {
+                let data = TensorData::new(floats(gradient), output.dims());
+                (output.clone() * Tensor::from_data(data, &output.device())).sum()
+            };
+            let [views, height, width, _] = rendered.color.dims();
+            let pixels = views * height * width;
+            let mut sum = weighed(rendered.color.reshape([3 * pixels]), &color)
+                + weighed(rendered.alpha.reshape([pixels]), &alpha);
+            if let Some((output, gradient)) = rendered.depth.zip(depth) {
+                sum = sum + weighed(output.reshape([pixels]), &gradient);
+            }
+            let gradients = sum.backward();
+            let Gaussians { means, rotations, scales, opacities, colors } = &inputs;
+            Ok([
+                means.grad(&gradients).map(host),
+                rotations.grad(&gradients).map(host),
+                scales.grad(&gradients).map(host),
+                opacities.grad(&gradients).map(host),
+                colors.grad(&gradients).map(host),
+                background.and_then(|background| background.grad(&gradients)).map(host),
+            ])
+        })?;
+        Ok(gradients.map(|values| values.map(|values| bytes(py, &values))))
+    }
+}
+
+/// Number of views, height, width; colour, alpha and depth; and the tape if gradients are wanted.
+type Output<'py> = (
+    [usize; 3],
+    Bound<'py, PyByteArray>,
+    Bound<'py, PyByteArray>,
+    Option<Bound<'py, PyByteArray>>,
+    Option<Tape>,
+);
+
+/// Renders Gaussians into the cameras of a JSON text or of a file.
+#[pyfunction]
+#[pyo3(signature = (arrays, *, cameras_json, cameras_path, background, preset, antialiased, depth, device, gradients))]
+#[allow(clippy::too_many_arguments, reason = "keywords in Python")]
+pub fn rasterize<'py>(
+    py: Python<'py>,
+    arrays: Arrays,
+    cameras_json: Option<String>,
+    cameras_path: Option<PathBuf>,
+    background: Option<PyBackedBytes>,
+    preset: String,
+    antialiased: bool,
+    depth: bool,
+    device: String,
+    gradients: bool,
+) -> PyResult<Output<'py>> {
+    let (forward, [color, alpha, depth]) = run(py, move |_| {
+        let preset = match &*preset {
+            "inria" => Preset::Inria,
+            "gsplat" => Preset::Gsplat,
+            _ => return Err(unsuitable("preset", "must be inria or gsplat")),
+        };
+        let device = snapsnap::device::choose_for_one(&device)?;
+        let device = if gradients { device.autodiff() } else { device };
+        let mut inputs = gaussians(&arrays, &device)?;
+        let mut background: Option<Tensor<1>> =
+            background.map(|color| tensor(&color, 3, &device).squeeze_dim(0));
+        if gradients {
+            let Gaussians { means, rotations, scales, opacities, colors } = inputs;
+            inputs = Gaussians {
+                means: means.require_grad(),
+                rotations: rotations.require_grad(),
+                scales: scales.require_grad(),
+                opacities: opacities.require_grad(),
+                colors: colors.require_grad(),
+            };
+            background = background.map(Tensor::require_grad);
+        }
+        let cameras = cameras(cameras_json.as_deref(), cameras_path.as_deref())?;
+        let mut options = preset.options();
+        (options.antialiased, options.depth) = (antialiased, depth);
+        options.background.clone_from(&background);
+        let rendered = render(&inputs, &cameras, &options)?;
+        let numbers = [
+            Some(host(rendered.color.clone())),
+            Some(host(rendered.alpha.clone())),
+            rendered.depth.clone().map(host),
+        ];
+        Ok((Forward { inputs, background, rendered }, numbers))
+    })?;
+    let [views, height, width, _] = forward.rendered.color.dims();
+    let array = |values: Option<Vec<f32>>| values.map(|values| bytes(py, &values));
+    let tape = gradients.then(|| Tape(Arc::new(Mutex::new(Some(forward)))));
+    let [color, alpha] = [color, alpha].map(|values| bytes(py, &values.unwrap_or_default()));
+    Ok(([views, height, width], color, alpha, array(depth), tape))
+}
