@@ -253,15 +253,6 @@ fn a_closed_or_full_output_stream_never_panics() {
 }
 
 #[test]
-fn an_interrupted_or_refused_import_leaves_the_old_file() {
-    let place = Workplace::with_weights();
-    place.write("old", "precious");
-    // The tiny weights do not fit the published size.
-    let message = place.refusal(&mut place.run("import-weights w -o old"));
-    assert!(message.contains("the config asks for"), "{message}");
-}
-
-#[test]
 fn weights_can_be_a_folder_and_seeds_give_the_same_bytes() {
     let place = Workplace::with_weights();
     fs::create_dir(place.path("model")).expect("folder");

@@ -216,14 +216,6 @@ fn a_ply_becomes_a_ply_of_the_same_numbers_without_what_is_not_finite() {
     assert_eq!(format!("{found:?}"), format!("{expected:?}"));
 }
 
-#[test]
-fn a_render_reads_an_spz() {
-    let place = Workplace::empty();
-    let mut render = place.run("render --orbit 2 --size 64x64 --device cpu");
-    succeed(render.arg(data("spz/v3_degree3.spz")));
-    assert!(place.path("renders/001.png").is_file());
-}
-
 /// A GLB has the same Gaussians with activated values and unit quaternions, for any SH degree.
 #[test]
 fn a_glb_is_the_same_cloud() {
