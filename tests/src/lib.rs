@@ -163,13 +163,24 @@ pub fn succeed(command: &mut Command) -> String {
     out.into_owned()
 }
 
-/// Runs a command that must refuse its input with exit code 2. Returns its message.
-pub fn refused(command: &mut Command) -> String {
+/// Runs a command that must end without a panic. Returns its exit code and its messages on stderr.
+pub fn ended(command: &mut Command) -> (Option<i32>, String) {
     let output = command.output().expect("the program starts");
     let err = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(2), "{command:?}: {err}");
     assert!(!err.contains("panicked"), "{err}");
+    (output.status.code(), err)
+}
+
+/// Runs a command that must end with this exit code. Returns its messages on stderr.
+pub fn ended_with(code: i32, command: &mut Command) -> String {
+    let (found, err) = ended(command);
+    assert_eq!(found, Some(code), "{command:?}: {err}");
     err
+}
+
+/// Runs a command that must refuse its input with exit code 2. Returns its message.
+pub fn refused(command: &mut Command) -> String {
+    ended_with(2, command)
 }
 
 /// The command under a limit of `ulimit`: `-v` kilobytes of memory, or files of `-f` blocks, which imitate a full disk.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use snapsnap_tests::{limited, names, refused, root, sample, snapsnap, succeed};
+use snapsnap_tests::{ended_with, limited, names, refused, root, sample, snapsnap, succeed};
 
 /// The sample pair, small, under these names.
 fn pair(folder: &Path, front: &str, back: &str) {
@@ -24,9 +24,7 @@ fn reconstruct(pairs: &Path, output: &Path) -> Command {
 
 /// Runs a command that fails for some people (exit code 1). Returns the rows of the list of failures.
 fn failed(command: &mut Command, list: &Path) -> Vec<[String; 2]> {
-    let output = command.output().expect("starts");
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(1), "{said}");
+    let said = ended_with(1, command);
     assert!(said.contains(&list.display().to_string()), "{said}");
     let mut rows = csv::Reader::from_path(list).expect("a list");
     assert_eq!(rows.headers().expect("headers"), vec!["name", "error"]);

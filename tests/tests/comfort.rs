@@ -4,7 +4,7 @@ use std::fs;
 
 use serde_json::Value;
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{fill_weights, limited, refused, root, snapsnap, succeed};
+use snapsnap_tests::{ended_with, fill_weights, limited, refused, root, snapsnap, succeed};
 
 #[test]
 fn the_doctor_names_devices_weights_and_what_mends() {
@@ -55,9 +55,7 @@ fn a_report_that_the_disk_does_not_take_is_a_failure() {
     ];
     for arguments in COMMANDS {
         let full = fs::File::options().write(true).open("/dev/full").expect("a device");
-        let done = snapsnap().args(arguments).stdout(full).output().expect("runs");
-        assert_eq!(done.status.code(), Some(2), "{arguments:?}");
-        let said = String::from_utf8(done.stderr).expect("text");
+        let said = refused(snapsnap().args(arguments).stdout(full));
         assert!(said.contains("stdout: cannot write"), "{arguments:?}: {said}");
     }
 }
@@ -94,12 +92,8 @@ fn a_senseless_number_of_threads_is_refused() {
 #[test]
 #[cfg(target_os = "linux")]
 fn loaders_of_drivers_print_nothing() {
-    let output = snapsnap().arg("doctor").env_remove("XDG_RUNTIME_DIR").output().expect("runs");
-    assert!(
-        output.status.success() && output.stderr.is_empty(),
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
+    let said = ended_with(0, snapsnap().arg("doctor").env_remove("XDG_RUNTIME_DIR"));
+    assert!(said.is_empty(), "{said}");
 }
 
 /// A software adapter that is opened with so little memory ends the process that opens it.

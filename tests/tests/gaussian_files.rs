@@ -11,7 +11,7 @@ use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 use snapsnap_tests::character::glb;
 use snapsnap_tests::ply::{Format, cloud, ply_bytes};
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{Numbers, data, refused, relative_error, snapsnap, succeed, values};
+use snapsnap_tests::{Numbers, data, ended_with, refused, relative_error, snapsnap, succeed, values};
 
 /// A PLY of `n` Gaussians with spherical harmonics of degree 1.
 fn ply(path: &Path, n: usize, bad: Option<usize>) {
@@ -207,9 +207,8 @@ fn a_ply_becomes_a_ply_of_the_same_numbers_without_what_is_not_finite() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let [first, second] = ["a.ply", "b.PLY"].map(|name| temporary.path().join(name));
     ply(&first, 20, Some(7));
-    let output = snapsnap().arg("convert").args([&first, &second]).output().expect("the program starts");
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && said.contains("1 Gaussians were left out"), "{said}");
+    let said = ended_with(0, snapsnap().arg("convert").args([&first, &second]));
+    assert!(said.contains("1 Gaussians were left out"), "{said}");
     let mut expected = Stored::read(&first).expect("read");
     assert_eq!(expected.drop_undrawable(), 1);
     let found = Stored::read(&second).expect("read");
@@ -424,9 +423,8 @@ fn every_command_draws_the_same_gaussians() {
     // Rows of zeros have no rotation.
     write("zeros.ply", &|i, property, value| if i < 3 && property.starts_with("rot") { 0.0 } else { value });
     for command in ["render zeros.ply --orbit 1 --size 8 --raw raw", "convert zeros.ply less.ply"] {
-        let output = place.run(command).output().expect("starts");
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.success() && said.contains("zeros.ply: 3 Gaussians were left out"), "{said}");
+        let said = ended_with(0, &mut place.run(command));
+        assert!(said.contains("zeros.ply: 3 Gaussians were left out"), "{said}");
     }
 }
 
