@@ -8,8 +8,6 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::say;
 
-/// Bytes between two plain lines.
-const LINE_BYTES: u64 = 500_000_000;
 /// Plain lines over all steps of a command.
 const LINES: u64 = 10;
 
@@ -23,7 +21,7 @@ pub fn shown(bar: ProgressBar, template: &str) -> Option<ProgressBar> {
 pub struct Progress {
     bar: Option<ProgressBar>,
     plain: bool,
-    /// Bytes or steps reported by the last plain line.
+    /// Steps reported by the last plain line.
     reported: Cell<u64>,
     start: Instant,
 }
@@ -34,10 +32,11 @@ impl Progress {
         Self::new(ProgressBar::new_spinner(), "{spinner} {msg} [{elapsed}]")
     }
 
-    /// Progress in bytes of a file, with rate and time left.
-    pub fn bytes() -> Self {
-        let template = "{bar:40} {bytes}/{total_bytes} {bytes_per_sec} {eta} left";
-        Self::new(ProgressBar::new(0), template)
+    /// Progress of a file, for functions that report finished and all bytes.
+    pub fn megabytes() -> impl Fn(u64, u64) {
+        let progress = Self::steps(0, "MB");
+        let megabytes = |bytes: u64| (bytes / 1_000_000) as usize;
+        move |done, total| progress.step(megabytes(done), megabytes(total), "MB")
     }
 
     /// Progress in equal steps of a known number, with rate and time left.
@@ -79,24 +78,13 @@ impl Progress {
             bar.set_length(total);
             bar.set_position(done);
         } else if self.plain
-            && done > 0
+            && done > self.reported.get()
             && (done == total || done >= self.reported.get() + total.div_ceil(LINES))
         {
             self.reported.set(done);
             let rate = done as f64 / self.start.elapsed().as_secs_f64();
             let left = (total - done) as f64 / rate;
             say::err(&format!("{done} of {total} {unit}, {rate:.1} a second, {left:.0} s left"));
-        }
-    }
-
-    /// Reports the number of finished bytes.
-    pub fn advance(&self, done: u64, total: u64) {
-        if let Some(bar) = &self.bar {
-            bar.set_length(total);
-            bar.set_position(done);
-        } else if self.plain && done >= self.reported.get() + LINE_BYTES {
-            self.reported.set(done);
-            say::err(&format!("{} of {} MB", done / 1_000_000, total / 1_000_000));
         }
     }
 }
