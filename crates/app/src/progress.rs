@@ -32,25 +32,26 @@ impl Progress {
         Self::new(ProgressBar::new_spinner(), "{spinner} {msg} [{elapsed}]")
     }
 
-    /// Progress of a file, for functions that report finished and all bytes.
-    pub fn megabytes() -> impl Fn(u64, u64) {
-        let progress = Self::steps(0, "MB");
-        let megabytes = |bytes: u64| (bytes / 1_000_000) as usize;
-        move |done, total| progress.step(megabytes(done), megabytes(total), "MB")
+    /// A function that is told the numbers of finished and of all steps, with rate and time left. The progress ends when
+    /// the function is dropped.
+    pub fn counted(unit: &'static str) -> impl Fn(usize, usize) {
+        let template = format!("{{bar:40}} {{pos}}/{{len}} {unit} {{per_sec}} {{eta}} left");
+        let progress = Self::new(ProgressBar::new(0), &template);
+        move |done, total| progress.step(done, total, unit)
     }
 
-    /// Progress in equal steps of a known number, with rate and time left.
-    pub fn steps(total: usize, unit: &str) -> Self {
-        let template = format!("{{bar:40}} {{pos}}/{{len}} {unit} {{per_sec}} {{eta}} left");
-        Self::new(ProgressBar::new(total as u64), &template)
+    /// As [`Self::counted`], for finished and all bytes.
+    pub fn megabytes() -> impl Fn(u64, u64) {
+        let step = Self::counted("MB");
+        let megabytes = |bytes: u64| (bytes / 1_000_000) as usize;
+        move |done, total| step(megabytes(done), megabytes(total))
     }
 
     /// Iterates over `items` and counts each as a step when the next one is requested.
-    pub fn over<T>(items: impl ExactSizeIterator<Item = T>, unit: &str) -> impl Iterator<Item = T> {
-        let total = items.len();
-        let progress = Self::steps(total, unit);
+    pub fn over<T>(items: impl ExactSizeIterator<Item = T>, unit: &'static str) -> impl Iterator<Item = T> {
+        let (total, step) = (items.len(), Self::counted(unit));
         items.map(Some).chain([None]).enumerate().map_while(move |(done, item)| {
-            progress.step(done, total, unit);
+            step(done, total);
             item
         })
     }
@@ -72,7 +73,7 @@ impl Progress {
     }
 
     /// Reports the number of finished steps.
-    pub fn step(&self, done: usize, total: usize, unit: &str) {
+    fn step(&self, done: usize, total: usize, unit: &str) {
         let (done, total) = (done as u64, total as u64);
         if let Some(bar) = &self.bar {
             bar.set_length(total);

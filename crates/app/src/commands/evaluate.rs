@@ -101,11 +101,9 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
     let folder = ReportFolder::new(&arguments.output, &inputs)?;
 
-    let people = sets.iter().map(|set| set.chosen.len()).sum();
-    let progress = Progress::steps(people, "people");
-    let done = |done: usize, total: usize| progress.step(done, total, "people");
     let start = Instant::now();
-    let mut outcome = evaluate(&config, &sets, &contestants, lpips.as_ref().ok(), &done);
+    let progress = Progress::counted("people");
+    let mut outcome = evaluate(&config, &sets, &contestants, lpips.as_ref().ok(), &progress);
     let cost = Cost { seconds: start.elapsed().as_secs_f64(), memory: memory::most_used() };
     drop(progress);
     outcome.left_out.splice(0..0, missing);
@@ -181,11 +179,7 @@ fn judge_meshes(
     }
     let folder = ReportFolder::new(&arguments.output, &[&arguments.config])?;
     let alignment = config.metrics.align.description();
-    let total = sets.iter().map(|set| set.chosen.len()).sum();
-    let progress = Progress::steps(total, "people");
-    let done = |done: usize, total: usize| progress.step(done, total, "people");
-    let (figures, mut left_out) = evaluate_meshes(config, sets, meshes, &done);
-    drop(progress);
+    let (figures, mut left_out) = evaluate_meshes(config, sets, meshes, &Progress::counted("people"));
     left_out.splice(0..0, missing);
     let header = header("cpu");
     folder.text("config.toml", &config.to_toml())?;

@@ -84,7 +84,7 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
         return batch.end(0);
     }
     output::write(&path, toml::to_string_pretty(&settings).expect("TOML types").as_bytes())?;
-    let progress = Progress::steps(jobs.len(), "people");
+    let progress = Progress::counted("people");
     let (to_networks, photographs) = sync_channel(1);
     let (to_writer, people) = sync_channel(1);
     let (to_list, ended) = sync_channel(jobs.len());
@@ -96,7 +96,7 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
         let mut results = 0;
         let mut count = |(name, result): (String, Result<(), Failure>)| {
             results += 1;
-            progress.step(results, jobs.len(), "people");
+            progress(results, jobs.len());
             result.or_else(|failure| batch.failed(&name, failure))
         };
         for (job, read) in jobs.iter().zip(photographs) {

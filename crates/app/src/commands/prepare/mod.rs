@@ -77,9 +77,7 @@ struct CheckArguments {
 }
 
 fn check(arguments: &CheckArguments) -> Result<(), Failure> {
-    let progress = Progress::steps(0, "subjects");
-    let checked = dataset::check(&arguments.dataset, |done, all| progress.step(done, all, "subjects"))?;
-    drop(progress);
+    let checked = dataset::check(&arguments.dataset, Progress::counted("subjects"))?;
     for problem in &checked.problems {
         say::out(problem);
     }
