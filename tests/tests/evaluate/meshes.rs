@@ -41,8 +41,7 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
     assert!(aligned[0].as_f64().is_some_and(|degrees| (degrees - 4.0).abs() < 1.5), "{aligned}");
     let text = fs::read_to_string(report.join("report.md")).expect("a report");
     assert!(text.contains("rigid, by iterated closest points"), "{text}");
-    // The option's former name, with a value.
-    let (_, _, scaled) = run(&["--icp", "similarity"]);
+    let (_, _, scaled) = run(&["--align", "similarity"]);
     assert!(scaled[2].as_f64().is_some_and(|scale| (scale - 1.0).abs() < 0.03 && scale != 1.0), "{scaled}");
 }
 

@@ -48,13 +48,13 @@ pub struct Arguments {
     against: Option<PathBuf>,
     /// Also evaluate the model on changed photographs. grey: every pixel of the person gets the person's mean colour,
     /// so that only the outline is left.
-    #[arg(long, value_parser = one_of(INPUTS), value_name = "KIND", conflicts_with = "mesh_dir")]
-    inputs: Option<bool>,
+    #[arg(long, value_parser = ["grey"], value_name = "KIND", conflicts_with = "mesh_dir")]
+    inputs: Option<String>,
     /// Evaluate the meshes NAME.obj, .ply or .glb in this folder instead of weights.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["weights", "against"])]
     mesh_dir: Option<PathBuf>,
     /// Align models or meshes with the ground truth first: turned and moved (rigid), or scaled as well (similarity).
-    #[arg(long, alias = "icp", value_parser = one_of(ALIGN), value_name = "HOW", num_args = 0..=1)]
+    #[arg(long, value_parser = one_of(ALIGN), value_name = "HOW", num_args = 0..=1)]
     #[arg(default_missing_value = "rigid")]
     align: Option<Align>,
     #[command(flatten)]
@@ -69,8 +69,6 @@ pub struct Arguments {
 
 const ALIGN: [(&str, &str, Align); 3] =
     [("none", "", Align::None), ("rigid", "", Align::Rigid), ("similarity", "", Align::Similarity)];
-/// Kinds of photographs, and whether they are grey.
-const INPUTS: [(&str, &str, bool); 1] = [("grey", "", true)];
 /// The end of the message about failed parts.
 const REST: &str = "the rest, if there is any, was evaluated";
 
@@ -89,11 +87,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     };
     let devices = names.iter().map(|name| device::choose(name)).collect::<Result<Vec<_>, _>>()?;
     let variants = config.variants(names);
-    let inputs: Vec<&Path> = std::iter::once(&arguments.config)
-        .chain(variants.iter().filter_map(|(_, variant)| variant.weights.as_ref()))
-        .chain(&arguments.lpips.files)
-        .map(PathBuf::as_path)
-        .collect();
+    let inputs = inputs(&arguments.config, &variants, &arguments.lpips);
     let lpips = arguments.lpips.load(&config.metrics.lpips, &names[0])?;
     let contestants = contestants(&config, &variants, &devices[0], &mut missing);
     if contestants.is_empty() {
@@ -134,6 +128,17 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     summarise(&json);
     say::info(&format!("{}: report.md, report.json, pictures and tables", folder.path.display()));
     complete(&report.outcome.left_out, REST)
+}
+
+/// Files that a report must not replace.
+pub(super) fn inputs<'a>(
+    config: &'a Path,
+    variants: &'a [(String, Variant)],
+    lpips: &'a perceptual::Arguments,
+) -> Vec<&'a Path> {
+    let weights = variants.iter().filter_map(|(_, variant)| variant.weights.as_ref());
+    let files = weights.chain(&lpips.files).map(PathBuf::as_path);
+    std::iter::once(config).chain(files).collect()
 }
 
 /// Refuses a config without data sets.
@@ -207,8 +212,8 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
     if let Some(align) = arguments.align {
         config.metrics.align = align;
     }
-    if let Some(grey) = arguments.inputs {
-        let photographs = Some(PhotographChanges { grey, ..config.photographs });
+    if arguments.inputs.is_some() {
+        let photographs = Some(PhotographChanges { grey: true, ..config.photographs });
         config.ablations.insert("grey".into(), Variant { photographs, ..Variant::default() });
     }
     check_utf8(config.data.folders.iter().chain(&config.model.weights).chain(&arguments.against))?;
