@@ -17,7 +17,7 @@ use std::process::Command;
 use std::sync::OnceLock;
 
 use burn::tensor::{Device, DeviceKind, DeviceType, Tensor, TensorData};
-use safetensors::SafeTensors;
+use safetensors::{Dtype, SafeTensors};
 
 /// A short training of small networks.
 pub const TRAINING: &str = concat!(
@@ -315,20 +315,14 @@ impl Numbers {
 
     /// Shape and values of an f32 tensor.
     pub fn f32(&self, name: &str) -> (Vec<usize>, Vec<f32>) {
-        let file = self.file();
-        let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
-        assert_eq!(view.dtype(), safetensors::Dtype::F32, "{name}");
-        let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-        (view.shape().to_vec(), values.collect())
+        let (shape, bytes) = self.bytes(name, Dtype::F32);
+        (shape, bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect())
     }
 
     /// Shape and values of an f64 tensor.
     pub fn f64(&self, name: &str) -> (Vec<usize>, Vec<f64>) {
-        let file = self.file();
-        let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
-        assert_eq!(view.dtype(), safetensors::Dtype::F64, "{name}");
-        let value = |b: &[u8]| f64::from_le_bytes(b.try_into().expect("eight bytes"));
-        (view.shape().to_vec(), view.data().chunks_exact(8).map(value).collect())
+        let (shape, bytes) = self.bytes(name, Dtype::F64);
+        (shape, bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b)).collect())
     }
 
     /// The value of `key` in the file's metadata.
@@ -339,9 +333,13 @@ impl Numbers {
 
     /// Shape and values of a u8 tensor.
     pub fn u8(&self, name: &str) -> (Vec<usize>, Vec<u8>) {
+        self.bytes(name, Dtype::U8)
+    }
+
+    fn bytes(&self, name: &str, kind: Dtype) -> (Vec<usize>, Vec<u8>) {
         let file = self.file();
         let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
-        assert_eq!(view.dtype(), safetensors::Dtype::U8, "{name}");
+        assert_eq!(view.dtype(), kind, "{name}");
         (view.shape().to_vec(), view.data().to_vec())
     }
 

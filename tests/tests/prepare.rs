@@ -89,13 +89,6 @@ fn shards_and_reruns_give_what_one_run_gives() {
         .arg("--config");
     assert!(refused(given.arg(shared.join("prepare.config.toml"))).contains("`views.pitch`"));
     assert!(files(&shared) == before);
-    // A config in a new folder without people does not restrict the settings.
-    let new = temporary.path().join("new");
-    fs::create_dir(&new).expect("made");
-    fs::copy(shared.join("prepare.config.toml"), new.join("prepare.config.toml")).expect("copied");
-    let mut given = prepare("synth");
-    given.args(["--subjects", "1", "--set", "views.pitch=2", "-o"]).arg(&new).arg("--config");
-    succeed(given.arg(new.join("prepare.config.toml")));
     // A data set without people takes new settings.
     let empty = temporary.path().join("empty");
     fs::create_dir(&empty).expect("made");
