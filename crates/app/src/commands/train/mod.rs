@@ -27,6 +27,7 @@ use snapsnap_train::task::Task;
 use super::evaluate::check_data;
 use crate::batch::unpanicked;
 use crate::failure::{Failure, bail};
+use crate::report::quoted;
 use crate::{device, interrupt, memory, say};
 
 use folder::RunFolder;
@@ -325,17 +326,6 @@ impl<'a> Plan<'a> {
             ),
         };
         say::info(&format!("next:    {next}"));
-    }
-}
-
-/// A path as a shell takes it.
-fn quoted(path: &Path) -> String {
-    let text = path.display().to_string();
-    let is_plain = |c: char| c.is_alphanumeric() || "/._-+:=@%,".contains(c);
-    if !text.is_empty() && text.chars().all(is_plain) {
-        text
-    } else {
-        format!("'{}'", text.replace('\'', r"'\''"))
     }
 }
 
