@@ -17,8 +17,8 @@ const USAGE: &str = "usage: cargo xtask test [FILTERâ€¦] | lint | dist [OPTIONâ€
   dist     the smallest program, target/dist/snapsnap, in 20 minutes; it reads pictures more slowly (docs/inference.md);
            options are cargo's
   fuzz     damaged files of every format that the program reads; see cargo xtask fuzz --help
-  bundle   [--features vulkan] [-o FILE.tar.xz]: program, tests, benchmark and a script that runs them and writes a
-           report, for a machine without cargo
+  bundle   [--features vulkan]: program, tests, benchmark and a script that runs them and writes a report, for a machine
+           without cargo, target/snapsnap-bundle.tar.xz
   COMMAND  a snapsnap command with its arguments, for example: cargo xtask demo";
 
 /// Devices beside the default one that the numerical tests run on.
@@ -36,13 +36,17 @@ fn main() -> ExitCode {
         Some("lint") => lint(),
         Some("dist") => dist(rest),
         Some("fuzz") => fuzz::run(rest),
-        Some("bundle") => match bundle::Options::parse(rest) {
-            Ok(options) => bundle::bundle(&options).map_err(|e| eprintln!("error: {e}")).is_ok(),
-            Err(e) => {
-                eprintln!("error: {e}\n\n{USAGE}");
-                return ExitCode::from(2);
-            }
-        },
+        Some("bundle") => {
+            let features = match rest {
+                [] => None,
+                [option, features] if option == "--features" => Some(features.as_str()),
+                _ => {
+                    eprintln!("{USAGE}");
+                    return ExitCode::from(2);
+                }
+            };
+            bundle::bundle(features).map_err(|e| eprintln!("error: {e}")).is_ok()
+        }
         Some(_) => {
             let mut run = cargo(&["run", "--release", "--bin", "snapsnap", "--"]);
             let code = run.args(&arguments).status().ok().and_then(|status| status.code());
