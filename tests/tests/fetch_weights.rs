@@ -185,15 +185,10 @@ fn what_has_the_name_of_an_unfinished_download_and_is_none_stays() {
     let (victim, part) = (temporary.path().join("victim"), temporary.path().join(format!("{FILE}.part")));
     fs::write(&victim, "mine").expect("writes");
     let (address, _) = server(|_, first| ranged(&published(), first, usize::MAX));
-    for link in [
-        |from: &Path, to: &Path| std::os::unix::fs::symlink(from, to),
-        |from: &Path, to: &Path| fs::hard_link(from, to),
-    ] {
-        link(&victim, &part).expect("links");
-        assert!(refused(&mut fetch(&address, temporary.path())).contains("is no unfinished download"));
-        assert_eq!(fs::read_to_string(&victim).expect("kept"), "mine");
-        fs::remove_file(&part).expect("removes");
-    }
+    std::os::unix::fs::symlink(&victim, &part).expect("links");
+    assert!(refused(&mut fetch(&address, temporary.path())).contains("is no unfinished download"));
+    assert_eq!(fs::read_to_string(&victim).expect("kept"), "mine");
+    fs::remove_file(&part).expect("removes");
     // A mirror without the file leaves an unfinished download alone.
     fs::write(&part, "a beginning").expect("writes");
     let empty = tempfile::tempdir().expect("a folder");

@@ -161,7 +161,7 @@ fn copy(item: &Item, folder: &Path, path: &Path) -> Result<(), Failure> {
 fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
     let part = path.with_file_name(format!("{}.part", item.file));
     // A file of another kind with that name is left alone.
-    if part.symlink_metadata().is_ok_and(|there| !there.is_file() || is_shared(&there)) {
+    if part.symlink_metadata().is_ok_and(|there| !there.is_file()) {
         let message = "is no unfinished download, but a link or a special file: move it away";
         return Err(Failure::file(&part, message));
     }
@@ -183,17 +183,6 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
         broken(&part, &e)
     })?;
     file::rename(&part, path).map_err(|e| Failure::cannot_write(path, &e))
-}
-
-/// Whether a file has another name as well.
-#[cfg(unix)]
-fn is_shared(file: &fs::Metadata) -> bool {
-    std::os::unix::fs::MetadataExt::nlink(file) > 1
-}
-
-#[cfg(not(unix))]
-fn is_shared(_: &fs::Metadata) -> bool {
-    false
 }
 
 /// Why a file was not written.
