@@ -294,6 +294,16 @@ pub fn shared(name: &str) -> PathBuf {
     root().join("../shared").join(name)
 }
 
+/// A folder beside the checkout, or `None`, with a printed note, if it is not there.
+pub fn shared_folder(name: &str) -> Option<PathBuf> {
+    let folder = shared(name);
+    if !folder.is_dir() {
+        println!("SKIPPED: {} is not there", folder.display());
+        return None;
+    }
+    Some(folder)
+}
+
 /// A `.safetensors` file in memory.
 pub struct Numbers(Vec<u8>);
 

@@ -10,7 +10,7 @@ use snapsnap_mesh::mesh::Mesh;
 use snapsnap_people::avatars::{Avatars, Character};
 use snapsnap_tests::character::{CLOTH, SKIN, character};
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{refused, shared, succeed};
+use snapsnap_tests::{refused, shared_folder, succeed};
 
 /// Settings of small and few views.
 const SMALL: &str = "--set views.count=4 --set views.resolution=64";
@@ -178,11 +178,7 @@ fn what_is_wrong_with_a_character_is_named() {
 /// Real characters, if they are beside the checkout.
 #[test]
 fn real_characters_stand_upright() {
-    let folder = shared("avatars");
-    if !folder.is_dir() {
-        println!("SKIPPED: {} is not there", folder.display());
-        return;
-    }
+    let Some(folder) = shared_folder("avatars") else { return };
     let avatars = Avatars::open(&folder, |_| true).expect("opens");
     for index in 0..12 {
         assert_stands(

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use image::{DynamicImage, GrayImage, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use snapsnap_tests::workplace::{Workplace, person};
-use snapsnap_tests::{Numbers, fill_weights, refused, root, shared, succeed};
+use snapsnap_tests::{Numbers, fill_weights, refused, root, shared_folder, succeed};
 
 /// Properties and rows of a binary PLY.
 fn read_ply(path: &Path) -> (Vec<String>, Vec<Vec<f32>>) {
@@ -266,11 +266,7 @@ fn weights_can_be_a_folder_and_seeds_give_the_same_bytes() {
 
 #[test]
 fn sample_photographs_stand_where_training_subjects_stand() {
-    let samples = shared("samples/0000");
-    if !samples.exists() {
-        println!("SKIPPED: no sample photographs {}", samples.display());
-        return;
-    }
+    let Some(samples) = shared_folder("samples/0000") else { return };
     let place = Workplace::with_weights();
     let pair = ["front.png", "back.png"].map(|name| samples.join(name));
     succeed(place.reconstruct("--dump dump").args(pair));
