@@ -92,6 +92,16 @@ fn adapter(kind: DeviceType) -> bool {
     found
 }
 
+/// [`device`], unless it is a software GPU, which compiles kernels for minutes.
+pub fn real_device() -> Option<Device> {
+    let device = device()?;
+    if is_software(&device) {
+        println!("SKIPPED: on a software adapter this takes minutes");
+        return None;
+    }
+    Some(device)
+}
+
 /// Whether a device is a software GPU, on which kernels are slow.
 pub fn is_software(device: &Device) -> bool {
     device.identity().is_some_and(|identity| identity.physical.is_none())
