@@ -69,22 +69,19 @@ fn features() -> Option<&'static str> {
     None
 }
 
-/// Whether a file is the library, not one of its relatives such as `libclang-cpp`.
-fn is_libclang(name: &str) -> bool {
-    let rest = name.strip_prefix("libclang").unwrap_or("-");
-    rest.starts_with(".so")
-        || rest.starts_with(".dylib")
-        || rest.starts_with('-') && rest[1..].starts_with(|c: char| c.is_ascii_digit())
-}
-
 fn has_libclang() -> bool {
+    /// Starts of the library's names with and without a version, not of its relatives such as `libclang-cpp`.
+    const NAMES: [&str; 4] = ["libclang.so", "libclang.dylib", "libclang-1", "libclang-2"];
     let entries = |folder: &Path| {
         let entries = fs::read_dir(folder).into_iter().flatten().flatten();
         entries.map(|entry| entry.path()).collect::<Vec<_>>()
     };
     let below = entries(Path::new("/usr/lib")).into_iter().flat_map(|folder| [folder.join("lib"), folder]);
     let mut folders = below.chain(["/usr/lib".into(), "/usr/lib64".into()]);
-    let is_it = |path: &PathBuf| path.file_name().is_some_and(|name| is_libclang(&name.to_string_lossy()));
+    let is_it = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        NAMES.iter().any(|start| name.starts_with(start))
+    };
     env::var_os("LIBCLANG_PATH").is_some() || folders.any(|folder| entries(&folder).iter().any(is_it))
 }
 
