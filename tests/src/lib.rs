@@ -17,7 +17,7 @@ use std::process::Command;
 use std::sync::OnceLock;
 
 use burn::tensor::{Device, DeviceKind, DeviceType, Tensor, TensorData};
-use safetensors::SafeTensors;
+use safetensors::{Dtype, SafeTensors};
 
 /// A short training of small networks.
 pub const TRAINING: &str = concat!(
@@ -90,6 +90,16 @@ fn adapter(kind: DeviceType) -> bool {
         println!("SKIPPED: no {name} adapter on this machine");
     }
     found
+}
+
+/// [`device`], unless it is a software GPU, which compiles kernels for minutes.
+pub fn real_device() -> Option<Device> {
+    let device = device()?;
+    if is_software(&device) {
+        println!("SKIPPED: on a software adapter this takes minutes");
+        return None;
+    }
+    Some(device)
 }
 
 /// Whether a device is a software GPU, on which kernels are slow.
@@ -167,13 +177,24 @@ pub fn succeed(command: &mut Command) -> String {
     out.into_owned()
 }
 
-/// Runs a command that must refuse its input with exit code 2. Returns its message.
-pub fn refused(command: &mut Command) -> String {
+/// Runs a command that must end without a panic. Returns its exit code and its messages on stderr.
+pub fn ended(command: &mut Command) -> (Option<i32>, String) {
     let output = command.output().expect("the program starts");
     let err = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(2), "{command:?}: {err}");
     assert!(!err.contains("panicked"), "{err}");
+    (output.status.code(), err)
+}
+
+/// Runs a command that must end with this exit code. Returns its messages on stderr.
+pub fn ended_with(code: i32, command: &mut Command) -> String {
+    let (found, err) = ended(command);
+    assert_eq!(found, Some(code), "{command:?}: {err}");
     err
+}
+
+/// Runs a command that must refuse its input with exit code 2. Returns its message.
+pub fn refused(command: &mut Command) -> String {
+    ended_with(2, command)
 }
 
 /// The command under a limit of `ulimit`: `-v` kilobytes of memory, or files of `-f` blocks, which imitate a full disk.
@@ -287,6 +308,16 @@ pub fn shared(name: &str) -> PathBuf {
     root().join("../shared").join(name)
 }
 
+/// A folder beside the checkout, or `None`, with a printed note, if it is not there.
+pub fn shared_folder(name: &str) -> Option<PathBuf> {
+    let folder = shared(name);
+    if !folder.is_dir() {
+        println!("SKIPPED: {} is not there", folder.display());
+        return None;
+    }
+    Some(folder)
+}
+
 /// A `.safetensors` file in memory.
 pub struct Numbers(Vec<u8>);
 
@@ -308,20 +339,14 @@ impl Numbers {
 
     /// Shape and values of an f32 tensor.
     pub fn f32(&self, name: &str) -> (Vec<usize>, Vec<f32>) {
-        let file = self.file();
-        let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
-        assert_eq!(view.dtype(), safetensors::Dtype::F32, "{name}");
-        let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-        (view.shape().to_vec(), values.collect())
+        let (shape, bytes) = self.bytes(name, Dtype::F32);
+        (shape, bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect())
     }
 
     /// Shape and values of an f64 tensor.
     pub fn f64(&self, name: &str) -> (Vec<usize>, Vec<f64>) {
-        let file = self.file();
-        let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
-        assert_eq!(view.dtype(), safetensors::Dtype::F64, "{name}");
-        let value = |b: &[u8]| f64::from_le_bytes(b.try_into().expect("eight bytes"));
-        (view.shape().to_vec(), view.data().chunks_exact(8).map(value).collect())
+        let (shape, bytes) = self.bytes(name, Dtype::F64);
+        (shape, bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b)).collect())
     }
 
     /// The value of `key` in the file's metadata.
@@ -332,9 +357,13 @@ impl Numbers {
 
     /// Shape and values of a u8 tensor.
     pub fn u8(&self, name: &str) -> (Vec<usize>, Vec<u8>) {
+        self.bytes(name, Dtype::U8)
+    }
+
+    fn bytes(&self, name: &str, kind: Dtype) -> (Vec<usize>, Vec<u8>) {
         let file = self.file();
         let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
-        assert_eq!(view.dtype(), safetensors::Dtype::U8, "{name}");
+        assert_eq!(view.dtype(), kind, "{name}");
         (view.shape().to_vec(), view.data().to_vec())
     }
 

@@ -9,10 +9,11 @@ use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_people::avatars::{Avatars, Character};
 use snapsnap_tests::character::{CLOTH, SKIN, character};
-use snapsnap_tests::{refused, shared, snapsnap, succeed};
+use snapsnap_tests::workplace::Workplace;
+use snapsnap_tests::{refused, shared_folder, succeed};
 
 /// Settings of small and few views.
-const SMALL: [&str; 4] = ["--set", "views.count=4", "--set", "views.resolution=64"];
+const SMALL: &str = "--set views.count=4 --set views.resolution=64";
 
 /// A folder of characters, one file each.
 fn folder(people: usize) -> tempfile::TempDir {
@@ -120,36 +121,22 @@ fn characters_face_forwards() {
 
 #[test]
 fn characters_become_a_data_set_whose_splits_share_no_person() {
-    let (people, out) = (folder(18), tempfile::tempdir().expect("temporary folder"));
-    let prepare = |split: &str, subjects: &str| {
-        let mut command = snapsnap();
-        command.args(["prepare", "avatars"]).arg(people.path()).args([
-            "--subjects",
-            subjects,
-            "--split",
-            split,
-            "-o",
-        ]);
-        command.arg(out.path().join("people")).args(SMALL);
+    let (people, place) = (folder(18), Workplace::empty());
+    let prepare = |people: &Path, line: &str| {
+        let mut command = place.run(&format!("prepare avatars {line} {SMALL}"));
+        command.arg(people);
         command
     };
     for split in ["train", "val", "test"] {
-        succeed(&mut prepare(split, "2"));
+        succeed(&mut prepare(people.path(), &format!("--subjects 2 --split {split} -o people")));
     }
-    let report = succeed(snapsnap().args(["prepare", "check"]).arg(out.path().join("people")));
+    let report = succeed(&mut place.run("prepare check people"));
     assert!(report.contains("6 subjects, 24 views: no fault"), "{report}");
     // Files of 18 people: two for test, two for val.
     let of = |part: fn(usize) -> bool| Avatars::open(people.path(), part).is_ok();
     assert!(of(|person| person == 0) && of(|person| person == 17) && !of(|person| person == 18));
     // Too few people.
-    let few = folder(1);
-    let mut command = snapsnap();
-    command
-        .args(["prepare", "avatars"])
-        .arg(few.path())
-        .args(["--subjects", "1", "-o"])
-        .arg(out.path().join("few"));
-    let error = refused(command.args(SMALL));
+    let error = refused(&mut prepare(folder(1).path(), "--subjects 1 -o few"));
     assert!(error.contains("people are too few to share among the splits"), "{error}");
 }
 
@@ -191,11 +178,7 @@ fn what_is_wrong_with_a_character_is_named() {
 /// Real characters, if they are beside the checkout.
 #[test]
 fn real_characters_stand_upright() {
-    let folder = shared("avatars");
-    if !folder.is_dir() {
-        println!("SKIPPED: {} is not there", folder.display());
-        return;
-    }
+    let Some(folder) = shared_folder("avatars") else { return };
     let avatars = Avatars::open(&folder, |_| true).expect("opens");
     for index in 0..12 {
         assert_stands(

@@ -1,15 +1,13 @@
 //! `doctor`, help, manual pages, completions, and messages about weights and drivers.
 
-use std::fs;
-
 use serde_json::Value;
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{fill_weights, limited, refused, root, snapsnap, succeed};
+use snapsnap_tests::{ended_with, fill_weights, limited, names, refused, root, snapsnap, succeed};
 
 #[test]
 fn the_doctor_names_devices_weights_and_what_mends() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let said = succeed(snapsnap().current_dir(temporary.path()).args(["doctor", "--json"]));
+    let place = Workplace::empty();
+    let said = succeed(&mut place.run("doctor --json"));
     let report: Value = serde_json::from_str(&said).expect("JSON");
     let devices = report["devices"].as_array().expect("devices");
     assert!(
@@ -25,7 +23,7 @@ fn the_doctor_names_devices_weights_and_what_mends() {
     let missing = report["missing"].as_array().expect("a list");
     assert!(missing.iter().any(|m| m["mend"].as_str().is_some_and(|mend| mend.contains("fetch-weights"))));
 
-    let said = succeed(snapsnap().current_dir(temporary.path()).arg("doctor"));
+    let said = succeed(&mut place.run("doctor"));
     for part in [
         "compiled in",
         "\nbf16 ",
@@ -35,11 +33,10 @@ fn the_doctor_names_devices_weights_and_what_mends() {
     ] {
         assert!(said.contains(part), "{part}: {said}");
     }
-    fs::write(temporary.path().join("bad.safetensors"), "no weights").expect("written");
-    let doctor =
-        |path: &str| refused(snapsnap().current_dir(temporary.path()).args(["doctor", "--weights", path]));
-    assert!(doctor("bad.safetensors").contains("bad.safetensors"));
-    assert!(doctor("none.safetensors").contains("none.safetensors"));
+    place.write("bad.safetensors", "no weights");
+    for file in ["bad.safetensors", "none.safetensors"] {
+        assert!(refused(&mut place.run(&format!("doctor --weights {file}"))).contains(file));
+    }
 }
 
 #[test]
@@ -54,10 +51,8 @@ fn a_report_that_the_disk_does_not_take_is_a_failure() {
         &["fetch-weights", "--list"],
     ];
     for arguments in COMMANDS {
-        let full = fs::File::options().write(true).open("/dev/full").expect("a device");
-        let done = snapsnap().args(arguments).stdout(full).output().expect("runs");
-        assert_eq!(done.status.code(), Some(2), "{arguments:?}");
-        let said = String::from_utf8(done.stderr).expect("text");
+        let full = std::fs::File::options().write(true).open("/dev/full").expect("a device");
+        let said = refused(snapsnap().args(arguments).stdout(full));
         assert!(said.contains("stdout: cannot write"), "{arguments:?}: {said}");
     }
 }
@@ -94,12 +89,8 @@ fn a_senseless_number_of_threads_is_refused() {
 #[test]
 #[cfg(target_os = "linux")]
 fn loaders_of_drivers_print_nothing() {
-    let output = snapsnap().arg("doctor").env_remove("XDG_RUNTIME_DIR").output().expect("runs");
-    assert!(
-        output.status.success() && output.stderr.is_empty(),
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
+    let said = ended_with(0, snapsnap().arg("doctor").env_remove("XDG_RUNTIME_DIR"));
+    assert!(said.is_empty(), "{said}");
 }
 
 /// A software adapter that is opened with so little memory ends the process that opens it.
@@ -113,13 +104,12 @@ fn drivers_crash_no_command() {
 
 #[test]
 fn every_command_has_a_manual_page_and_an_example() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    succeed(snapsnap().current_dir(temporary.path()).args(["man", "-o", "pages"]));
-    let mut count = 0;
-    for entry in fs::read_dir(temporary.path().join("pages")).expect("a folder") {
-        let path = entry.expect("an entry").path();
-        let name = path.file_stem().expect("a name").to_string_lossy().into_owned();
-        let page = fs::read_to_string(&path).expect("a page");
+    let place = Workplace::empty();
+    succeed(&mut place.run("man -o pages"));
+    let pages = names(&place.path("pages"));
+    for file in &pages {
+        let page = String::from_utf8(place.read(&format!("pages/{file}"))).expect("a page");
+        let name = file.trim_end_matches(".1");
         assert!(page.contains(".TH") && page.contains("SYNOPSIS"), "{name}");
         let words: Vec<&str> = if name.starts_with("snapsnap-prepare-") {
             name.splitn(3, '-').skip(1).collect()
@@ -128,9 +118,8 @@ fn every_command_has_a_manual_page_and_an_example() {
         };
         let help = succeed(snapsnap().args(&words).arg("--help"));
         assert!(help.contains("Example") || help.contains("First steps"), "{name} has no example:\n{help}");
-        count += 1;
     }
-    assert!(count > 20, "{count}");
+    assert!(pages.len() > 20, "{pages:?}");
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use image::{DynamicImage, GrayImage, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use snapsnap_tests::workplace::{Workplace, person};
-use snapsnap_tests::{Numbers, fill_weights, refused, root, shared, succeed};
+use snapsnap_tests::{Numbers, fill_weights, refused, root, shared_folder, succeed};
 
 /// Properties and rows of a binary PLY.
 fn read_ply(path: &Path) -> (Vec<String>, Vec<Vec<f32>>) {
@@ -253,15 +253,6 @@ fn a_closed_or_full_output_stream_never_panics() {
 }
 
 #[test]
-fn an_interrupted_or_refused_import_leaves_the_old_file() {
-    let place = Workplace::with_weights();
-    place.write("old", "precious");
-    // The tiny weights do not fit the published size.
-    let message = place.refusal(&mut place.run("import-weights w -o old"));
-    assert!(message.contains("the config asks for"), "{message}");
-}
-
-#[test]
 fn weights_can_be_a_folder_and_seeds_give_the_same_bytes() {
     let place = Workplace::with_weights();
     fs::create_dir(place.path("model")).expect("folder");
@@ -275,11 +266,7 @@ fn weights_can_be_a_folder_and_seeds_give_the_same_bytes() {
 
 #[test]
 fn sample_photographs_stand_where_training_subjects_stand() {
-    let samples = shared("samples/0000");
-    if !samples.exists() {
-        println!("SKIPPED: no sample photographs {}", samples.display());
-        return;
-    }
+    let Some(samples) = shared_folder("samples/0000") else { return };
     let place = Workplace::with_weights();
     let pair = ["front.png", "back.png"].map(|name| samples.join(name));
     succeed(place.reconstruct("--dump dump").args(pair));

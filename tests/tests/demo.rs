@@ -8,7 +8,7 @@ use snapsnap_net::config::{RegressorConfig, RotationFrame};
 use snapsnap_net::weights::{Source, WeightFile, save};
 use snapsnap_splat::scene;
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{names, refused, root, snapsnap, succeed};
+use snapsnap_tests::{names, root, succeed};
 
 /// Least PSNR on the person in unseen views. The photographs as flat cut-outs have at most 15 dB
 /// (docs/notes/evaluation.md).
@@ -16,11 +16,10 @@ const LEAST_DB: f64 = 16.0;
 
 #[test]
 fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let mut command = snapsnap();
-    command.current_dir(temporary.path()).args(["demo", "--device", "cpu"]);
+    let place = Workplace::empty();
+    let mut command = place.run("demo --device cpu");
     let said = succeed(&mut command);
-    let folder = temporary.path().join("demo");
+    let folder = place.path("demo");
     let expected = [
         "back.png",
         "comparison.png",
@@ -33,8 +32,7 @@ fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
     ];
     assert_eq!(names(&folder), expected);
     assert!(expected.iter().all(|name| said.contains(&format!("demo/{name}"))), "{said}");
-    let report = fs::read_to_string(folder.join("report.json")).expect("a report");
-    let report: serde_json::Value = serde_json::from_str(&report).expect("JSON");
+    let report: serde_json::Value = serde_json::from_slice(&place.read("demo/report.json")).expect("JSON");
     for degrees in ["45", "135", "270"] {
         let psnr = report["psnr_masked"][degrees].as_f64().expect("a figure");
         assert!(psnr > LEAST_DB, "{degrees}°: {psnr} dB");
@@ -43,19 +41,16 @@ fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
     assert_eq!(Some(gaussians.gaussians.len() as u64), report["gaussians"].as_u64());
     let sheet = image::open(folder.join("comparison.png")).expect("a picture");
     assert_eq!(sheet.dimensions(), (1792, 512));
-    let gif = fs::read(folder.join("turntable.gif")).expect("an animation");
-    assert_eq!(image::guess_format(&gif).expect("a picture"), ImageFormat::Gif);
+    assert_eq!(image::guess_format(&place.read("demo/turntable.gif")).expect("a picture"), ImageFormat::Gif);
     // A second demo replaces the first one, even an incomplete one.
-    fs::write(folder.join("human.ply"), "cut").expect("written");
-    fs::write(folder.join("report.json"), r#"{"command":"snapsnap demo","commit":"0"}"#).expect("written");
+    place.write("demo/human.ply", "cut");
+    place.write("demo/report.json", r#"{"command":"snapsnap demo","commit":"0"}"#);
     succeed(&mut command);
     scene::read(&folder.join("human.ply"), &burn::tensor::Device::flex()).expect("a PLY");
-    let other = temporary.path().join("mine");
-    fs::create_dir(&other).expect("a folder");
-    fs::write(other.join("human.ply"), "mine").expect("written");
-    let message = refused(snapsnap().current_dir(temporary.path()).args(["demo", "-o", "mine"]));
+    fs::create_dir(place.path("mine")).expect("a folder");
+    place.write("mine/human.ply", "mine");
+    let message = place.refusal(&mut place.run("demo -o mine"));
     assert!(message.contains("human.ply") && message.contains("another folder"), "{message}");
-    assert_eq!(fs::read_to_string(other.join("human.ply")).expect("read"), "mine");
 }
 
 #[test]

@@ -11,13 +11,13 @@ use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 use snapsnap_tests::character::glb;
 use snapsnap_tests::ply::{Format, cloud, ply_bytes};
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{Numbers, data, refused, relative_error, snapsnap, succeed, values};
+use snapsnap_tests::{Numbers, data, ended_with, refused, relative_error, succeed, values};
 
 /// A PLY of `n` Gaussians with spherical harmonics of degree 1.
-fn ply(path: &Path, n: usize, bad: Option<usize>) {
+fn ply(n: usize, bad: Option<usize>) -> Vec<u8> {
     let mut rows = cloud(n, 1);
     bad.into_iter().for_each(|bad| rows[bad][0].1 = f64::NAN);
-    fs::write(path, ply_bytes(&rows, Format::Ascii, "", b"")).expect("written");
+    ply_bytes(&rows, Format::Ascii, "", b"")
 }
 
 /// An SPZ keeps the rotation, not the quaternion's length and sign.
@@ -110,26 +110,19 @@ fn what_is_written_is_read_again() {
 /// A turned file looks as before from a turned camera, spherical harmonics included, and reads as before.
 #[test]
 fn a_ply_with_y_down_is_turned_and_turned_back() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
-    fs::write(path("any.ply"), ply_bytes(&cloud(200, 3), Format::Little, "", b"")).expect("written");
-    let convert = |from: &str, to: &str, more: &[&str]| {
-        let mut command = snapsnap();
-        command.arg("convert").arg(path(from)).arg(path(to)).args(more);
-        command
-    };
-    succeed(&mut convert("any.ply", "up.ply", &[]));
-    succeed(&mut convert("up.ply", "down.ply", &["--y-down"]));
-    succeed(&mut convert("down.ply", "again.ply", &[]));
-    let bytes = |name: &str| fs::read(path(name)).expect("reads");
-    assert!(bytes("up.ply") == bytes("again.ply"));
+    let place = Workplace::empty();
+    place.write("any.ply", ply_bytes(&cloud(200, 3), Format::Little, "", b""));
+    for files in ["any.ply up.ply", "up.ply down.ply --y-down", "down.ply again.ply"] {
+        succeed(&mut place.run(&format!("convert {files}")));
+    }
+    assert!(place.read("up.ply") == place.read("again.ply"));
     // As a viewer that does not know the comment.
-    let mut raw = bytes("down.ply");
+    let mut raw = place.read("down.ply");
     let at = raw.windows(12).position(|text| text == b"axes: y down").expect("the comment");
     raw[at..at + 12].copy_from_slice(b"no comment..");
-    fs::write(path("raw.ply"), raw).expect("written");
+    place.write("raw.ply", raw);
     let look = |name: &str, camera: &Camera| {
-        let loaded = scene::read(&path(name), &Device::flex()).expect("reads");
+        let loaded = scene::read(&place.path(name), &Device::flex()).expect("reads");
         let seen = loaded.seen_by(camera).expect("colours");
         values(render(&seen, std::slice::from_ref(camera), &RenderOptions::inria()).expect("renders").color)
     };
@@ -140,7 +133,7 @@ fn a_ply_with_y_down_is_turned_and_turned_back() {
         let largest = up.iter().zip(&down).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(largest < 1e-4 && up.iter().any(|value| *value > 0.1), "{largest}");
     }
-    assert!(refused(&mut convert("up.ply", "down.spz", &["--y-down"])).contains("y up by definition"));
+    assert!(refused(&mut place.run("convert up.ply down.spz --y-down")).contains("y up by definition"));
 }
 
 /// A colour that is no number is not black.
@@ -159,16 +152,15 @@ fn colours_that_are_not_finite_are_kept() {
 
 #[test]
 fn gaussians_go_into_an_spz_and_back_within_its_steps() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let [first, small, back] = ["a.ply", "a.spz", "b.ply"].map(|name| temporary.path().join(name));
-    ply(&first, 500, None);
-    let said = succeed(snapsnap().arg("convert").args([&first, &small]));
+    let place = Workplace::empty();
+    place.write("a.ply", ply(500, None));
+    let said = succeed(&mut place.run("convert a.ply a.spz"));
     assert!(said.contains("500 Gaussians of SH degree 1"), "{said}");
-    succeed(snapsnap().arg("convert").args([&small, &back]));
-    let size = |path: &Path| fs::metadata(path).expect("there").len();
-    assert!(3 * size(&small) < size(&back), "{} {}", size(&small), size(&back));
-    let device = Device::flex();
-    let [before, after] = [&first, &back].map(|path| scene::read(path, &device).expect("read"));
+    succeed(&mut place.run("convert a.spz b.ply"));
+    let [small, back] = ["a.spz", "b.ply"].map(|name| place.read(name).len());
+    assert!(3 * small < back, "{small} {back}");
+    let read = |name: &str| scene::read(&place.path(name), &Device::flex()).expect("read");
+    let (before, after) = (read("a.ply"), read("b.ply"));
     let apart =
         |a: Vec<f32>, b: Vec<f32>| a.iter().zip(b).fold(0.0_f32, |most, (a, b)| most.max((a - b).abs()));
     let (a, b) = (before.gaussians, after.gaussians);
@@ -181,9 +173,8 @@ fn gaussians_go_into_an_spz_and_back_within_its_steps() {
     let bands = |loaded: Option<_>| values::<3>(loaded.expect("degree 1"));
     assert!(apart(bands(before.harmonics)[3..].to_vec(), bands(after.harmonics)[3..].to_vec()) < 0.07);
     // A second quantisation changes nothing.
-    let again = temporary.path().join("again.spz");
-    succeed(snapsnap().arg("convert").args([&back, &again]));
-    let [once, twice] = [&small, &again].map(|path| scene::read(path, &device).expect("read").gaussians);
+    succeed(&mut place.run("convert b.ply again.spz"));
+    let [once, twice] = ["a.spz", "again.spz"].map(|name| read(name).gaussians);
     assert!(values(once.means) == values(twice.means) && values(once.scales) == values(twice.scales));
     assert!(values(once.opacities) == values(twice.opacities) && values(once.colors) == values(twice.colors));
     check_rotations(values(once.rotations), values(twice.rotations));
@@ -191,50 +182,37 @@ fn gaussians_go_into_an_spz_and_back_within_its_steps() {
 
 #[test]
 fn what_an_spz_holds_badly_is_told() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let [near, far, small] = ["a.ply", "b.ply", "b.spz"].map(|name| temporary.path().join(name));
-    ply(&near, 20, None);
-    let gaussians = scene::read(&near, &Device::flex()).expect("read").gaussians;
+    let place = Workplace::empty();
+    place.write("a.ply", ply(20, None));
+    let gaussians = scene::read(&place.path("a.ply"), &Device::flex()).expect("read").gaussians;
     let moved = Gaussians { means: gaussians.means.clone() + 1e6, ..gaussians };
-    scene::write(&moved, &far).expect("written");
-    let said = succeed(snapsnap().arg("convert").args([&far, &small]));
+    scene::write(&moved, &place.path("b.ply")).expect("written");
+    let said = succeed(&mut place.run("convert b.ply b.spz"));
     assert!(said.contains("centres are kept in steps of 125.0 mm"), "{said}");
-    assert!(!succeed(snapsnap().arg("convert").args([&near, &small])).contains("steps"));
+    assert!(!succeed(&mut place.run("convert a.ply b.spz")).contains("steps"));
 }
 
 #[test]
 fn a_ply_becomes_a_ply_of_the_same_numbers_without_what_is_not_finite() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let [first, second] = ["a.ply", "b.PLY"].map(|name| temporary.path().join(name));
-    ply(&first, 20, Some(7));
-    let output = snapsnap().arg("convert").args([&first, &second]).output().expect("the program starts");
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && said.contains("1 Gaussians were left out"), "{said}");
-    let mut expected = Stored::read(&first).expect("read");
-    assert_eq!(expected.drop_undrawable(), 1);
-    let found = Stored::read(&second).expect("read");
-    assert_eq!(format!("{found:?}"), format!("{expected:?}"));
-}
-
-#[test]
-fn a_render_reads_an_spz() {
     let place = Workplace::empty();
-    let mut render = place.run("render --orbit 2 --size 64x64 --device cpu");
-    succeed(render.arg(data("spz/v3_degree3.spz")));
-    assert!(place.path("renders/001.png").is_file());
+    place.write("a.ply", ply(20, Some(7)));
+    let said = ended_with(0, &mut place.run("convert a.ply b.PLY"));
+    assert!(said.contains("1 Gaussians were left out"), "{said}");
+    let mut expected = Stored::read(&place.path("a.ply")).expect("read");
+    assert_eq!(expected.drop_undrawable(), 1);
+    let found = Stored::read(&place.path("b.PLY")).expect("read");
+    assert_eq!(format!("{found:?}"), format!("{expected:?}"));
 }
 
 /// A GLB has the same Gaussians with activated values and unit quaternions, for any SH degree.
 #[test]
 fn a_glb_is_the_same_cloud() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
+    let place = Workplace::empty();
     for degree in 0..=3 {
-        fs::write(path("a.ply"), ply_bytes(&cloud(50, degree), Format::Little, "", b"")).expect("written");
-        for (from, to) in [("a.ply", "b.glb"), ("b.glb", "c.ply")] {
-            succeed(snapsnap().arg("convert").args([path(from), path(to)]));
-        }
-        let read = |name: &str| scene::read(&path(name), &Device::flex()).expect("a file");
+        place.write("a.ply", ply_bytes(&cloud(50, degree), Format::Little, "", b""));
+        succeed(&mut place.run("convert a.ply b.glb"));
+        succeed(&mut place.run("convert b.glb c.ply"));
+        let read = |name: &str| scene::read(&place.path(name), &Device::flex()).expect("a file");
         let before = read("a.ply");
         for name in ["b.glb", "c.ply"] {
             let after = read(name);
@@ -263,18 +241,17 @@ const SPLATS: &str = "/meshes/0/primitives/0/extensions/KHR_gaussian_splatting";
 
 #[test]
 fn glbs_without_gaussians_or_with_others_are_refused() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
-    ply(&path("a.ply"), 5, None);
-    succeed(snapsnap().arg("convert").args([path("a.ply"), path("a.glb")]));
-    let sound = fs::read(path("a.glb")).expect("a file");
+    let place = Workplace::empty();
+    place.write("a.ply", ply(5, None));
+    succeed(&mut place.run("convert a.ply a.glb"));
+    let sound = place.read("a.glb");
     let (description, buffer) = parts(&sound);
     let primitive = &description["meshes"][0]["primitives"][0];
     assert_eq!(primitive["extensions"]["KHR_gaussian_splatting"]["kernel"], "ellipse");
     let refusal = |bytes: &[u8]| {
-        fs::write(path("bad.glb"), bytes).expect("written");
-        let message = refused(snapsnap().arg("convert").args([path("bad.glb"), path("b.ply")]));
-        assert!(message.contains("bad.glb") && !path("b.ply").exists(), "{message}");
+        place.write("bad.glb", bytes);
+        let message = place.refusal(&mut place.run("convert bad.glb b.ply"));
+        assert!(message.contains("bad.glb"), "{message}");
         message
     };
     assert!(refusal(&sound[..sound.len() - 100]).contains("ends after"));
@@ -320,20 +297,24 @@ fn sog_picture(archive: &mut zip::ZipArchive<fs::File>, name: &str) -> Vec<[u8; 
 /// The values of a SOG, decoded as its specification says, equal the values of the cloud within the steps of bytes.
 #[test]
 fn a_sog_has_the_clouds_values_in_its_steps() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
+    let place = Workplace::empty();
     let n = 300;
-    fs::write(path("a.ply"), ply_bytes(&cloud(n, 1), Format::Little, "", b"")).expect("written");
-    let said = succeed(snapsnap().arg("convert").args([path("a.ply"), path("a.sog")]));
+    place.write("a.ply", ply_bytes(&cloud(n, 1), Format::Little, "", b""));
+    let said = succeed(&mut place.run("convert a.ply a.sog"));
     assert!(said.contains("degree 1 became degree 0"), "{said}");
-    let first = fs::read(path("a.sog")).expect("a file");
-    succeed(snapsnap().arg("convert").args([path("a.ply"), path("b.sog")]));
-    assert!(first == fs::read(path("b.sog")).expect("a file"), "the same bytes again");
-    let message = refused(snapsnap().arg("convert").args([path("a.sog"), path("c.ply")]));
+    succeed(&mut place.run("convert a.ply b.sog"));
+    assert!(place.read("a.sog") == place.read("b.sog"), "the same bytes again");
+    let message = refused(&mut place.run("convert a.sog c.ply"));
     assert!(message.contains("a SOG is written, but not read"), "{message}");
 
-    let mut archive = zip::ZipArchive::new(fs::File::open(path("a.sog")).expect("a file")).expect("a ZIP");
-    let meta: Value = serde_json::from_reader(archive.by_name("meta.json").expect("a member")).expect("JSON");
+    let opened = |name: &str| {
+        let file = fs::File::open(place.path(name)).expect("a file");
+        let mut archive = zip::ZipArchive::new(file).expect("a ZIP");
+        let meta: Value =
+            serde_json::from_reader(archive.by_name("meta.json").expect("a member")).expect("JSON");
+        (archive, meta)
+    };
+    let (mut archive, meta) = opened("a.sog");
     assert_eq!((&meta["version"], &meta["count"]), (&json!(2), &json!(n)));
     let numbers = |value: &Value| -> Vec<f32> {
         value.as_array().expect("a list").iter().map(|v| v.as_f64().expect("a number") as f32).collect()
@@ -345,7 +326,7 @@ fn a_sog_has_the_clouds_values_in_its_steps() {
         .map(|name| sog_picture(&mut archive, &format!("{name}.webp")));
     assert!(pictures.iter().all(|picture| picture.len() == 18 * 17), "{}", pictures[0].len());
 
-    let before = scene::read(&path("a.ply"), &Device::flex()).expect("a file").gaussians;
+    let before = scene::read(&place.path("a.ply"), &Device::flex()).expect("a file").gaussians;
     let [means, rotations, logs, dc] = [
         values(before.means),
         values(before.rotations),
@@ -387,12 +368,10 @@ fn a_sog_has_the_clouds_values_in_its_steps() {
     // One wild colour is cut off aloud, and leaves the others their codes.
     let mut rows = cloud(n, 0);
     rows[3].iter_mut().find(|(name, _)| *name == "f_dc_0").expect("a colour").1 = 1e30;
-    fs::write(path("wild.ply"), ply_bytes(&rows, Format::Little, "", b"")).expect("written");
-    let said = succeed(snapsnap().arg("convert").args([path("wild.ply"), path("wild.sog")]));
+    place.write("wild.ply", ply_bytes(&rows, Format::Little, "", b""));
+    let said = succeed(&mut place.run("convert wild.ply wild.sog"));
     assert!(said.contains("1 scales and colours beyond ±100 were cut off there"), "{said}");
-    let mut archive = zip::ZipArchive::new(fs::File::open(path("wild.sog")).expect("a file")).expect("a ZIP");
-    let meta: Value = serde_json::from_reader(archive.by_name("meta.json").expect("a member")).expect("JSON");
-    let wild = numbers(&meta["sh0"]["codebook"]);
+    let wild = numbers(&opened("wild.sog").1["sh0"]["codebook"]);
     let most = dc.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
     assert!(wild.iter().filter(|code| code.abs() <= most).count() > 100, "{wild:?}");
 }
@@ -432,31 +411,28 @@ fn every_command_draws_the_same_gaussians() {
     // Rows of zeros have no rotation.
     write("zeros.ply", &|i, property, value| if i < 3 && property.starts_with("rot") { 0.0 } else { value });
     for command in ["render zeros.ply --orbit 1 --size 8 --raw raw", "convert zeros.ply less.ply"] {
-        let output = place.run(command).output().expect("starts");
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.success() && said.contains("zeros.ply: 3 Gaussians were left out"), "{said}");
+        let said = ended_with(0, &mut place.run(command));
+        assert!(said.contains("zeros.ply: 3 Gaussians were left out"), "{said}");
     }
 }
 
 #[test]
 fn conversions_that_cannot_be_are_refused() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let (nothing, empty) = (temporary.path().join("nothing.ply"), temporary.path().join("empty.spz"));
-    ply(&nothing, 1, Some(0));
-    for command in [snapsnap().arg("convert").args([&nothing, &empty]), snapsnap().arg("view").arg(&nothing)]
-    {
-        let message = refused(command);
-        assert!(message.contains("nothing.ply: none of its 1 Gaussians can be drawn"), "{message}");
+    let place = Workplace::empty();
+    place.write("nothing.ply", ply(1, Some(0)));
+    place.write("a.ply", ply(5, None));
+    fs::copy(data("spz/v4_degree1.spz"), place.path("v4.spz")).expect("copied");
+    place.write("cut.spz", &fs::read(data("spz/v3_degree0.spz")).expect("read")[..300]);
+    let nothing = "nothing.ply: none of its 1 Gaussians can be drawn";
+    for (line, expected) in [
+        ("convert nothing.ply b.spz", nothing),
+        ("view nothing.ply", nothing),
+        ("convert a.ply a.splat", "is no .ply, .spz, .glb or .sog"),
+        ("convert none.ply b.spz", "none.ply: cannot read"),
+        ("convert v4.spz b.ply", "version 4"),
+        ("convert cut.spz b.ply", "is cut"),
+    ] {
+        let message = place.refusal(&mut place.run(line));
+        assert!(message.contains(expected), "{line}: {message}");
     }
-    assert!(!empty.exists());
-    let path = |name: &str| temporary.path().join(name);
-    ply(&path("a.ply"), 5, None);
-    let convert = |from: &str, to: &str| refused(snapsnap().arg("convert").args([path(from), path(to)]));
-    assert!(convert("a.ply", "a.splat").contains("is no .ply, .spz, .glb or .sog"));
-    assert!(convert("none.ply", "b.spz").contains("none.ply: cannot read"));
-    fs::copy(data("spz/v4_degree1.spz"), path("v4.spz")).expect("copied");
-    assert!(convert("v4.spz", "b.ply").contains("version 4"), "{}", convert("v4.spz", "b.ply"));
-    fs::write(path("cut.spz"), &fs::read(data("spz/v3_degree0.spz")).expect("read")[..300]).expect("written");
-    assert!(convert("cut.spz", "b.ply").contains("cut"));
-    assert!(!path("b.ply").exists() && !path("b.spz").exists());
 }

@@ -109,18 +109,6 @@ fn psnr_and_ssim_are_those_of_scikit_image_in_all_three_windows() {
     }
 }
 
-#[test]
-fn a_picture_is_infinitely_like_itself_and_never_more_than_1() {
-    for name in ["noise", "flat and slope", "people, shifted"] {
-        for picture in pair(name).map(picture) {
-            let region = Region::all(&picture);
-            assert_eq!(psnr(&picture, &picture, &region).expect("one size"), f64::INFINITY, "{name}");
-            assert_eq!(ssim(&picture, &picture, &region).expect("one size"), Some(1.0), "{name}");
-            assert_eq!(ssim_of_loss(&picture, &picture, &region).expect("one size"), 1.0, "{name}");
-        }
-    }
-}
-
 /// The metric computes in f64, the loss in f32 and with gradients.
 #[test]
 fn the_losss_similarity_is_the_one_that_training_uses() {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use snapsnap_tests::{files, limited, refused, root, shared, snapsnap, succeed};
+use snapsnap_tests::{files, limited, refused, root, shared_folder, snapsnap, succeed};
 
 /// Settings of small and few views.
 const SMALL: [&str; 4] = ["--set", "views.count=4", "--set", "views.resolution=64"];
@@ -89,13 +89,6 @@ fn shards_and_reruns_give_what_one_run_gives() {
         .arg("--config");
     assert!(refused(given.arg(shared.join("prepare.config.toml"))).contains("`views.pitch`"));
     assert!(files(&shared) == before);
-    // A config in a new folder without people does not restrict the settings.
-    let new = temporary.path().join("new");
-    fs::create_dir(&new).expect("made");
-    fs::copy(shared.join("prepare.config.toml"), new.join("prepare.config.toml")).expect("copied");
-    let mut given = prepare("synth");
-    given.args(["--subjects", "1", "--set", "views.pitch=2", "-o"]).arg(&new).arg("--config");
-    succeed(given.arg(new.join("prepare.config.toml")));
     // A data set without people takes new settings.
     let empty = temporary.path().join("empty");
     fs::create_dir(&empty).expect("made");
@@ -141,11 +134,7 @@ fn count(folder: &Path) -> usize {
 
 #[test]
 fn makehuman_people_become_a_data_set() {
-    let data = shared("makehuman");
-    if !data.is_dir() {
-        println!("SKIPPED: {} is not there", data.display());
-        return;
-    }
+    let Some(data) = shared_folder("makehuman") else { return };
     let temporary = tempfile::tempdir().expect("temporary folder");
     let make = |name: &str, split: &str| {
         let folder = temporary.path().join(name);
@@ -164,11 +153,7 @@ fn makehuman_people_become_a_data_set() {
 
 #[test]
 fn real_scans_with_several_materials_are_imported() {
-    let scans = shared("samples/scans");
-    if !scans.is_dir() {
-        println!("SKIPPED: {} is not there", scans.display());
-        return;
-    }
+    let Some(scans) = shared_folder("samples/scans") else { return };
     let temporary = tempfile::tempdir().expect("temporary folder");
     let folder = temporary.path().join("scans_128_4");
     let layout = ["--set", "views.layout=authors", "--set", "views.count=4", "--set", "views.resolution=128"];

@@ -1,8 +1,8 @@
 //! Meshes of Gaussians.
 
 use std::collections::HashSet;
-use std::fs;
 use std::path::Path;
+use std::process::Command;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use glam::Vec3;
@@ -11,7 +11,7 @@ use snapsnap_mesh::mesh::{Mesh, pieces};
 use snapsnap_splat::{Gaussians, scene};
 use snapsnap_tests::ply::balls;
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{refused, sample, snapsnap, succeed};
+use snapsnap_tests::{ended_with, refused, sample, succeed};
 
 /// An ellipsoid shell of round Gaussians with the half axes `half`, green above its middle and red below.
 fn shell(n: usize, half: Vec3, centre: Vec3) -> (Vec<f32>, Vec<f32>) {
@@ -31,12 +31,7 @@ fn shell(n: usize, half: Vec3, centre: Vec3) -> (Vec<f32>, Vec<f32>) {
 const HALF: Vec3 = Vec3::new(0.25, 0.9, 0.18);
 const CENTRE: Vec3 = Vec3::new(0.05, 0.9, -0.03);
 
-/// The ellipsoid, and a speck that flies beside it.
-fn written(path: &Path) {
-    written_around(path, CENTRE, 1.0);
-}
-
-/// The part of the ellipsoid below this share of its half height, and the speck.
+/// The part of the ellipsoid below this share of its half height, and a speck that flies beside it.
 fn written_around(path: &Path, centre: Vec3, height: f32) {
     let (mut means, mut colors) = shell(20_000, HALF, centre);
     // From top to bottom.
@@ -77,6 +72,11 @@ fn check_closed(mesh: &Mesh) {
     assert!(pieces(mesh.positions.len(), faces).iter().all(|piece| *piece == 0), "more than one piece");
 }
 
+/// `mesh` on the CPU.
+fn mesh_of(place: &Workplace, file: &str, to: &str, more: &str) -> Command {
+    place.run(&format!("mesh {file} -o {to} --device cpu {more}"))
+}
+
 fn volume(mesh: &Mesh) -> f64 {
     let corner = |row: u32| mesh.positions[row as usize].as_dvec3();
     let face = |rows: [u32; 3]| corner(rows[0]).dot(corner(rows[1]).cross(corner(rows[2]))) / 6.0;
@@ -85,20 +85,17 @@ fn volume(mesh: &Mesh) -> f64 {
 
 #[test]
 fn a_shell_becomes_one_closed_surface_of_its_size_and_colours_in_every_kind_of_file() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
+    let place = Workplace::empty();
     let expected = 4.0 / 3.0 * std::f64::consts::PI * f64::from(HALF.x * HALF.y * HALF.z);
     let far = Vec3::new(60.0, 12.0, -80.0);
     for (name, centre) in [("a.glb", CENTRE), ("a.obj", CENTRE), ("mesh.ply", far)] {
-        written_around(&path("human.ply"), centre, 1.0);
-        let mut command = snapsnap();
-        command.arg("mesh").arg(path("human.ply")).arg("-o").arg(path(name));
+        written_around(&place.path("human.ply"), centre, 1.0);
         // By default a GLB of 12,000 triangles has a texture. An OBJ with vertex colours needs no material file.
-        let options = ["--faces", "12000", "-v", "--device", "cpu", "--texture", "0"];
-        let said = succeed(command.args(&options[..if name == "mesh.ply" { 5 } else { 7 }]));
-        assert!(!path("a.mtl").exists());
+        let options = if name == "mesh.ply" { "-v" } else { "-v --texture 0" };
+        let said = succeed(&mut mesh_of(&place, "human.ply", name, &format!("--faces 12000 {options}")));
+        assert!(!place.path("a.mtl").exists());
         assert!(said.contains("flying pieces dropped: 1;"), "{said}");
-        let mesh = import::read(&path(name)).expect("a mesh");
+        let mesh = import::read(&place.path(name)).expect("a mesh");
         check_closed(&mesh);
         assert!(mesh.faces.len() <= 12_000 && mesh.faces.len() > 11_000, "{name}: {}", mesh.faces.len());
         let found = volume(&mesh);
@@ -118,14 +115,11 @@ fn a_shell_becomes_one_closed_surface_of_its_size_and_colours_in_every_kind_of_f
 /// Level cameras do not see the crown of a head.
 #[test]
 fn a_hole_at_the_top_is_closed_and_the_inside_stays_solid() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
+    let place = Workplace::empty();
     let height = 0.7;
-    written_around(&path("human.ply"), CENTRE, height);
-    let mut command = snapsnap();
-    command.arg("mesh").arg(path("human.ply")).arg("-o").arg(path("mesh.ply"));
-    succeed(command.args(["--faces", "0", "--device", "cpu"]));
-    let mesh = import::read(&path("mesh.ply")).expect("a mesh");
+    written_around(&place.path("human.ply"), CENTRE, height);
+    succeed(&mut mesh_of(&place, "human.ply", "mesh.ply", "--faces 0"));
+    let mesh = import::read(&place.path("mesh.ply")).expect("a mesh");
     check_closed(&mesh);
     let highest = mesh.positions.iter().map(|p| p.y - CENTRE.y).fold(f32::MIN, f32::max);
     assert!((highest - height * HALF.y).abs() < 0.03, "{highest}");
@@ -138,14 +132,11 @@ fn a_hole_at_the_top_is_closed_and_the_inside_stays_solid() {
 
 #[test]
 fn a_texture_has_the_colours_of_the_places_it_lies_on() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
-    written(&path("human.ply"));
-    let mut command = snapsnap();
-    command.arg("mesh").arg(path("human.ply")).arg("-o").arg(path("a.obj"));
-    succeed(command.args(["--faces", "4000", "--texture", "512", "--device", "cpu"]));
-    assert!(path("a.mtl").is_file() && path("a_0.png").is_file());
-    let mesh = import::read(&path("a.obj")).expect("a mesh");
+    let place = Workplace::empty();
+    written_around(&place.path("human.ply"), CENTRE, 1.0);
+    succeed(&mut mesh_of(&place, "human.ply", "a.obj", "--faces 4000 --texture 512"));
+    assert!(place.path("a.mtl").is_file() && place.path("a_0.png").is_file());
+    let mesh = import::read(&place.path("a.obj")).expect("a mesh");
     check_closed(&mesh);
     let texture = mesh.materials.iter().find_map(|material| material.texture.clone()).expect("a texture");
     assert_eq!(texture.dimensions(), (512, 512));
@@ -190,25 +181,17 @@ fn a_person_of_few_triangles_is_one_closed_surface() {
     assert!((few / all - 1.0).abs() < 0.05, "{few} m³ instead of {all}");
 }
 
-fn mesh_of(file: &Path, to: &Path, more: &[&str]) -> std::process::Output {
-    let mut command = snapsnap();
-    command.arg("mesh").arg(file).arg("-o").arg(to).args(["--device", "cpu"]).args(more);
-    command.output().expect("runs")
-}
-
 #[test]
 fn a_glb_has_a_texture_and_an_obj_has_normals_and_no_material_over_its_colours() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
-    written(&path("human.ply"));
-    for (name, more) in [("a.glb", &["--faces", "3000"][..]), ("a.obj", &["--faces", "3000"])] {
-        let made = mesh_of(&path("human.ply"), &path(name), more);
-        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let place = Workplace::empty();
+    written_around(&place.path("human.ply"), CENTRE, 1.0);
+    for name in ["a.glb", "a.obj"] {
+        succeed(&mut mesh_of(&place, "human.ply", name, "--faces 3000"));
     }
-    let glb = import::read(&path("a.glb")).expect("a mesh");
+    let glb = import::read(&place.path("a.glb")).expect("a mesh");
     let texture = glb.materials.iter().find_map(|material| material.texture.clone()).expect("a texture");
     assert_eq!(texture.dimensions(), (2048, 2048));
-    let text = fs::read_to_string(path("a.obj")).expect("text");
+    let text = String::from_utf8(place.read("a.obj")).expect("text");
     assert!(!text.contains("mtllib") && !text.contains("usemtl"));
     let numbers = |line: &str| -> Vec<f32> {
         line.split_whitespace().skip(1).map(|word| word.parse().expect("a number")).collect()
@@ -231,8 +214,7 @@ fn a_glb_has_a_texture_and_an_obj_has_normals_and_no_material_over_its_colours()
 
 #[test]
 fn bodies_keep_their_shape_unless_they_are_very_small_large_or_far_away() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
+    let place = Workplace::empty();
     let expected = 4.0 / 3.0 * std::f64::consts::PI * f64::from(HALF.x * HALF.y * HALF.z);
     let far = Vec3::new(60.0, 0.0, -80.0);
     let bodies = [
@@ -245,15 +227,15 @@ fn bodies_keep_their_shape_unless_they_are_very_small_large_or_far_away() {
     for (size, centre, is_made) in bodies {
         let (means, _) = shell(20_000, HALF * size, centre);
         let places: Vec<[f32; 3]> = means.as_chunks::<3>().0.to_vec();
-        fs::write(path("any.ply"), balls(places.into_iter(), (0.006 * size).ln())).expect("written");
-        let made = mesh_of(&path("any.ply"), &path("any_mesh.ply"), &["--faces", "12000"]);
-        let said = String::from_utf8_lossy(&made.stderr);
+        place.write("any.ply", balls(places.into_iter(), (0.006 * size).ln()));
+        let mut command = mesh_of(&place, "any.ply", "any_mesh.ply", "--faces 12000");
         if !is_made {
+            let said = refused(&mut command);
             assert!(said.contains("any.ply: no surface: a body of"), "{size}: {said}");
             continue;
         }
-        assert!(made.status.success(), "{size}: {said}");
-        let mesh = import::read(&path("any_mesh.ply")).expect("a mesh");
+        succeed(&mut command);
+        let mesh = import::read(&place.path("any_mesh.ply")).expect("a mesh");
         check_closed(&mesh);
         let found = volume(&mesh) / f64::from(size).powi(3);
         assert!((found / expected - 1.0).abs() < 0.08, "{size}: {found}, expected {expected}");
@@ -262,58 +244,45 @@ fn bodies_keep_their_shape_unless_they_are_very_small_large_or_far_away() {
 
 #[test]
 fn scenes_that_are_no_single_body_are_named() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
+    let place = Workplace::empty();
     let body = |centre: Vec3| shell(15_000, HALF, centre).0;
     let both = [body(Vec3::new(-0.6, 0.9, 0.0)), body(Vec3::new(0.6, 0.9, 0.0))].concat();
     let places: Vec<[f32; 3]> = both.as_chunks::<3>().0.to_vec();
-    fs::write(path("two.ply"), balls(places.into_iter(), 0.006_f32.ln())).expect("written");
-    let made = mesh_of(&path("two.ply"), &path("mesh.ply"), &[]);
-    let said = String::from_utf8_lossy(&made.stderr);
-    assert!(
-        made.status.success()
-            && said.contains("warning")
-            && said.contains("of the body's volume was dropped"),
-        "{said}"
-    );
+    place.write("two.ply", balls(places.into_iter(), 0.006_f32.ln()));
+    let said = ended_with(0, &mut mesh_of(&place, "two.ply", "mesh.ply", ""));
+    assert!(said.contains("warning") && said.contains("of the body's volume was dropped"), "{said}");
 
     // Gaussians in one place have no surface, and neither have Gaussians far larger than the body.
     let random = (0..1000_u32).map(|i| [0, 1, 2].map(|c| ((i * 7 + c * 331) % 997) as f32 / 997.0));
     let scenes = [balls((0..5000).map(|_| [0.0; 3]), 0.1_f32.ln()), balls(random, 70.0)];
     for scene in scenes {
-        fs::write(path("coarse.ply"), scene).expect("written");
-        let made = mesh_of(&path("coarse.ply"), &path("none.ply"), &[]);
-        let said = String::from_utf8_lossy(&made.stderr);
-        assert_eq!(made.status.code(), Some(2), "{said}");
+        place.write("coarse.ply", scene);
+        let said = place.refusal(&mut mesh_of(&place, "coarse.ply", "none.ply", ""));
         assert!(said.contains("coarse.ply: no surface: the Gaussians are too large"), "{said}");
     }
-    assert!(!path("none.ply").exists());
 }
 
 #[test]
 fn meshes_that_cannot_be_are_refused() {
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let path = |name: &str| temporary.path().join(name);
-    written(&path("human.ply"));
-    let mesh = |from: &str, to: &str, more: &[&str]| {
-        let mut command = snapsnap();
-        refused(
-            command.arg("mesh").arg(path(from)).arg("-o").arg(path(to)).args(more).args(["--device", "cpu"]),
-        )
-    };
-    assert!(mesh("human.ply", "a.stl", &[]).contains("neither .glb nor .obj nor .ply"));
-    assert!(mesh("human.ply", "a.ply", &["--texture", "512"]).contains("a PLY has no texture"));
-    assert!(mesh("human.ply", "no/such/folder/a.glb", &[]).contains("cannot write"));
-    assert!(mesh("human.ply", "a.glb", &["--texture", "3"]).contains("64"));
-    assert!(mesh("human.ply", "a\nb.obj", &[]).contains("must be plain text"));
+    let place = Workplace::empty();
+    written_around(&place.path("human.ply"), CENTRE, 1.0);
     // Files beside a new OBJ belong to something else.
-    fs::write(path("a.mtl"), "newmtl mine\n").expect("written");
-    assert!(mesh("human.ply", "a.obj", &["--texture", "64"]).contains("belongs to no mesh of this name"));
-    assert_eq!(fs::read_to_string(path("a.mtl")).expect("reads"), "newmtl mine\n");
+    place.write("a.mtl", "newmtl mine\n");
     let nothing = "ply\nformat ascii 1.0\nelement vertex 0\n".to_owned()
         + &scene::Stored::COLUMNS.map(|name| format!("property float {name}\n")).concat()
         + "end_header\n";
-    fs::write(path("empty.ply"), nothing).expect("written");
-    assert!(mesh("empty.ply", "a.glb", &[]).contains("no surface"));
-    assert!(!path("a.glb").exists());
+    place.write("empty.ply", nothing);
+    for (file, to, more, expected) in [
+        ("human.ply", "a.stl", "", "neither .glb nor .obj nor .ply"),
+        ("human.ply", "a.ply", "--texture 512", "a PLY has no texture"),
+        ("human.ply", "no/such/folder/a.glb", "", "cannot write"),
+        ("human.ply", "a.glb", "--texture 3", "64"),
+        ("human.ply", "a.obj", "--texture 64", "belongs to no mesh of this name"),
+        ("empty.ply", "a.glb", "", "no surface"),
+    ] {
+        let said = place.refusal(&mut mesh_of(&place, file, to, more));
+        assert!(said.contains(expected), "{to}: {said}");
+    }
+    let said = place.refusal(place.run("mesh human.ply --device cpu -o").arg("a\nb.obj"));
+    assert!(said.contains("must be plain text"), "{said}");
 }

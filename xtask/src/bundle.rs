@@ -12,37 +12,15 @@ const RUN: &str = include_str!("run.sh");
 /// Files and folders that the programs read.
 const DATA: [&str; 4] = ["configs", "tests/data", "README.md", "LICENSE"];
 
-/// Options of `bundle`.
-pub struct Options {
-    /// Features of the program, comma-separated.
-    pub features: Option<String>,
-    /// The archive.
-    pub output: PathBuf,
-}
+/// The archive.
+const ARCHIVE: &str = "target/snapsnap-bundle.tar.xz";
 
-impl Options {
-    /// Parses `[--features LIST] [-o FILE]`.
-    pub fn parse(arguments: &[String]) -> Result<Self, String> {
-        let mut options = Self { features: None, output: "target/snapsnap-bundle.tar.xz".into() };
-        let mut arguments = arguments.iter();
-        while let Some(argument) = arguments.next() {
-            let mut value = || arguments.next().cloned().ok_or_else(|| format!("{argument} needs a value"));
-            match argument.as_str() {
-                "--features" => options.features = Some(value()?),
-                "-o" | "--output" => options.output = value()?.into(),
-                other => return Err(format!("bundle: `{other}` is not understood")),
-            }
-        }
-        Ok(options)
-    }
-}
-
-/// Builds and packs.
-pub fn bundle(options: &Options) -> Result<(), String> {
+/// Builds and packs. `features` are those of the program, comma-separated.
+pub fn bundle(features: Option<&str>) -> Result<(), String> {
     let programs = [
-        ("snapsnap", build(options, &["build", "--bin", "snapsnap"])?),
-        ("numerical", build(options, &["test", "--no-run", "--test", "numerical"])?),
-        ("splat", build(options, &["bench", "--no-run", "--bench", "splat"])?),
+        ("snapsnap", build(features, &["build", "--bin", "snapsnap"])?),
+        ("numerical", build(features, &["test", "--no-run", "--test", "numerical"])?),
+        ("splat", build(features, &["bench", "--no-run", "--bench", "splat"])?),
     ];
     // Not beside the archive: a folder of this name may be an unpacked bundle.
     let folder = Path::new("target/bundle/snapsnap-bundle").to_owned();
@@ -56,35 +34,28 @@ pub fn bundle(options: &Options) -> Result<(), String> {
         copy(Path::new(path), &folder.join(path))?;
     }
     let script = folder.join("run.sh");
-    let device = match options.features.as_deref() {
-        Some(features) => features.split(',').next().unwrap_or("wgpu"),
-        None => "wgpu",
-    };
+    let device = features.and_then(|features| features.split(',').next()).unwrap_or("wgpu");
     let text = RUN
         .replace("@DEVICE@", device)
-        .replace("@FEATURES@", options.features.as_deref().unwrap_or("none"))
+        .replace("@FEATURES@", features.unwrap_or("none"))
         .replace("@COMMIT@", &commit());
     fs::write(&script, text).map_err(failed(&script))?;
-    executable(&script).map_err(failed(&script))?;
-    pack(&folder, &options.output)?;
-    let size = fs::metadata(&options.output).map_err(failed(&options.output))?.len();
+    let archive = Path::new(ARCHIVE);
+    pack(&folder, archive)?;
+    let size = fs::metadata(archive).map_err(failed(archive))?.len();
     fs::remove_dir_all(&folder).map_err(failed(&folder))?;
-    println!(
-        "{}: {:.1} MB; unpack it anywhere and start run.sh",
-        options.output.display(),
-        size as f64 / 1e6
-    );
+    println!("{ARCHIVE}: {:.1} MB; unpack it anywhere and start `sh run.sh`", size as f64 / 1e6);
     Ok(())
 }
 
 /// Builds one program of the workspace and returns its path. Other features have a target folder of their own, so that
 /// they do not replace the plain build.
-fn build(options: &Options, command: &[&str]) -> Result<PathBuf, String> {
+fn build(features: Option<&str>, command: &[&str]) -> Result<PathBuf, String> {
     let mut build = cargo(&command[..1]);
     // `cargo bench` takes the release profile by itself.
     build.args((command[0] != "bench").then_some("--release"));
     build.args(["--workspace", "--message-format=json-render-diagnostics"]).args(&command[1..]);
-    if let Some(features) = &options.features {
+    if let Some(features) = features {
         build.args(["--features", features]).args(["--target-dir", "target-gpu"]);
     }
     let output = build.stderr(Stdio::inherit()).output().map_err(|e| format!("cannot run cargo: {e}"))?;
@@ -137,15 +108,4 @@ fn commit() -> String {
     let git = Command::new("git").args(["describe", "--always", "--dirty"]).output();
     let text = git.ok().filter(|output| output.status.success()).map(|output| output.stdout);
     text.map_or_else(|| "unknown".into(), |text| String::from_utf8_lossy(&text).trim().to_owned())
-}
-
-#[cfg(unix)]
-fn executable(path: &Path) -> io::Result<()> {
-    use std::os::unix::fs::PermissionsExt;
-    fs::set_permissions(path, fs::Permissions::from_mode(0o755))
-}
-
-#[cfg(not(unix))]
-fn executable(_path: &Path) -> io::Result<()> {
-    Ok(())
 }

@@ -17,8 +17,8 @@ const USAGE: &str = "usage: cargo xtask test [FILTERâ€¦] | lint | dist [OPTIONâ€
   dist     the smallest program, target/dist/snapsnap, in 20 minutes; it reads pictures more slowly (docs/inference.md);
            options are cargo's
   fuzz     damaged files of every format that the program reads; see cargo xtask fuzz --help
-  bundle   [--features vulkan] [-o FILE.tar.xz]: program, tests, benchmark and a script that runs them and writes a
-           report, for a machine without cargo
+  bundle   [--features vulkan]: program, tests, benchmark and a script that runs them and writes a report, for a machine
+           without cargo, target/snapsnap-bundle.tar.xz
   COMMAND  a snapsnap command with its arguments, for example: cargo xtask demo";
 
 /// Devices beside the default one that the numerical tests run on.
@@ -36,13 +36,17 @@ fn main() -> ExitCode {
         Some("lint") => lint(),
         Some("dist") => dist(rest),
         Some("fuzz") => fuzz::run(rest),
-        Some("bundle") => match bundle::Options::parse(rest) {
-            Ok(options) => bundle::bundle(&options).map_err(|e| eprintln!("error: {e}")).is_ok(),
-            Err(e) => {
-                eprintln!("error: {e}\n\n{USAGE}");
-                return ExitCode::from(2);
-            }
-        },
+        Some("bundle") => {
+            let features = match rest {
+                [] => None,
+                [option, features] if option == "--features" => Some(features.as_str()),
+                _ => {
+                    eprintln!("{USAGE}");
+                    return ExitCode::from(2);
+                }
+            };
+            bundle::bundle(features).map_err(|e| eprintln!("error: {e}")).is_ok()
+        }
         Some(_) => {
             let mut run = cargo(&["run", "--release", "--bin", "snapsnap", "--"]);
             let code = run.args(&arguments).status().ok().and_then(|status| status.code());
@@ -65,22 +69,19 @@ fn features() -> Option<&'static str> {
     None
 }
 
-/// Whether a file is the library, not one of its relatives such as `libclang-cpp`.
-fn is_libclang(name: &str) -> bool {
-    let rest = name.strip_prefix("libclang").unwrap_or("-");
-    rest.starts_with(".so")
-        || rest.starts_with(".dylib")
-        || rest.starts_with('-') && rest[1..].starts_with(|c: char| c.is_ascii_digit())
-}
-
 fn has_libclang() -> bool {
+    /// Starts of the library's names with and without a version, not of its relatives such as `libclang-cpp`.
+    const NAMES: [&str; 4] = ["libclang.so", "libclang.dylib", "libclang-1", "libclang-2"];
     let entries = |folder: &Path| {
         let entries = fs::read_dir(folder).into_iter().flatten().flatten();
         entries.map(|entry| entry.path()).collect::<Vec<_>>()
     };
     let below = entries(Path::new("/usr/lib")).into_iter().flat_map(|folder| [folder.join("lib"), folder]);
     let mut folders = below.chain(["/usr/lib".into(), "/usr/lib64".into()]);
-    let is_it = |path: &PathBuf| path.file_name().is_some_and(|name| is_libclang(&name.to_string_lossy()));
+    let is_it = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        NAMES.iter().any(|start| name.starts_with(start))
+    };
     env::var_os("LIBCLANG_PATH").is_some() || folders.any(|folder| entries(&folder).iter().any(is_it))
 }
 

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Tests and measures snapsnap on this machine and writes report.md: ./run.sh [DEVICE [FOLDER]]
+# Tests and measures snapsnap on this machine and writes report.md: sh run.sh [DEVICE [FOLDER]]
 # DEVICE: @DEVICE@ (default), wgpu, vulkan, cpu, … as `bin/snapsnap reconstruct --help` has them. Needs no cargo.
 cd "$(dirname "$0")" || exit 1
 device=${1:-@DEVICE@}

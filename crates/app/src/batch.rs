@@ -184,7 +184,7 @@ pub fn each(
     if is_same_folder(folder, target) {
         return Err(Failure::file(target, "is the folder of the inputs: give another one"));
     }
-    let scenes: Vec<(String, PathBuf)> = scenes(folder)?.into_iter().collect();
+    let scenes = scenes(folder)?;
     let mut batch = Batch::new(target, shard)?;
     let missing = batch.missing(scenes, |(name, _)| output(name));
     for (name, path) in Progress::over(missing.iter(), "files") {
@@ -196,24 +196,22 @@ pub fn each(
 }
 
 /// The files of Gaussians in a folder, by name without extension.
-fn scenes(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Failure> {
+fn scenes(folder: &Path) -> Result<Vec<(String, PathBuf)>, Failure> {
     let mut found = BTreeMap::new();
-    let mut names = BTreeMap::new();
     for path in files(folder)? {
         if Kind::named(&path).is_none_or(|kind| kind == Kind::Sog) {
             continue;
         }
         let name = stem(&path)?;
         // Some file systems do not tell upper from lower case.
-        if let Some(other) = names.insert(name.to_lowercase(), path.clone()) {
+        if let Some((_, other)) = found.insert(name.to_lowercase(), (name, path.clone())) {
             return Err(same_name(&path, &other));
         }
-        found.insert(name, path);
     }
     if found.is_empty() {
         return Err(Failure::file(folder, "has no PLY, SPZ or GLB"));
     }
-    Ok(found)
+    Ok(found.into_values().collect())
 }
 
 /// The failure of two files with one name.

@@ -74,7 +74,7 @@ impl Guests {
 
     /// Whether the device has joined.
     pub fn knows(&self, request: &Request) -> bool {
-        let cookies = request.cookie.as_deref().unwrap_or_default().split(';');
+        let cookies = request.header("cookie").unwrap_or_default().split(';');
         let named = cookies.filter_map(|cookie| cookie.trim().split_once('='));
         let keys = self.keys.lock().unwrap_or_else(PoisonError::into_inner);
         named.filter(|(name, _)| *name == COOKIE).any(|(_, value)| keys.known.iter().any(|key| key == value))

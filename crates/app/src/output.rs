@@ -4,6 +4,8 @@ use std::fs;
 use std::io::{ErrorKind, Write};
 use std::path::{Component, Path, PathBuf};
 
+use serde::Serialize;
+use snapsnap_base::config::{differences, keys};
 use snapsnap_base::file::{self, write_whole};
 use snapsnap_splat::scene::Kind;
 
@@ -56,6 +58,18 @@ pub fn check_kind(path: &Path) -> Result<(), Failure> {
         return Ok(());
     }
     Err(Failure::file(path, "is no .ply, .spz, .glb or .sog; the extension says what to write"))
+}
+
+/// Refuses to go on in the folder of a config, `there`, that differs from the `wanted` one.
+pub fn check_settings(path: &Path, there: &impl Serialize, wanted: &impl Serialize) -> Result<(), Failure> {
+    let differing = differences(&keys(there), &keys(wanted)).into_iter();
+    let differing: Vec<String> = differing.map(|(_, message)| message).collect();
+    if differing.is_empty() {
+        return Ok(());
+    }
+    let differing = differing.join(", ");
+    let message = format!("is of people made with other settings: {differing}; give another folder");
+    Err(Failure::file(path, message))
 }
 
 /// Refuses an output in a data set or its source (one of `roots`): a data set would take a folder for a subject without

@@ -119,7 +119,7 @@ fn refused(request: &Request, port: u16, guests: Option<&Guests>) -> Option<Answ
             _ => request.is_near && ["127.0.0.1", "localhost"].contains(&name),
         })
     };
-    if !request.host.as_deref().is_some_and(is_own) {
+    if !request.header("host").is_some_and(is_own) {
         return Some(text(StatusCode::FORBIDDEN, "only for http://127.0.0.1"));
     }
     if let Some(guests) = guests.filter(|_| !request.is_near) {
@@ -133,9 +133,10 @@ fn refused(request: &Request, port: u16, guests: Option<&Guests>) -> Option<Answ
         }
     }
     // A page of another site may lead here, but may not start any work.
-    let is_own_origin = |origin: &String| origin.strip_prefix("http://").is_some_and(is_own);
-    let is_own_page = request.origin.as_ref().is_none_or(is_own_origin)
-        && request.fetch_site.as_deref().is_none_or(|site| ["same-origin", "none"].contains(&site));
+    let is_own_origin = |origin: &str| origin.strip_prefix("http://").is_some_and(is_own);
+    // By this header a browser names the requesting page's relation to the server.
+    let is_own_page = request.header("origin").is_none_or(is_own_origin)
+        && request.header("sec-fetch-site").is_none_or(|site| ["same-origin", "none"].contains(&site));
     (!is_own_page && request.path != "/")
         .then(|| text(StatusCode::FORBIDDEN, "only for this server's own page"))
 }
@@ -204,13 +205,18 @@ fn steps<T>(change: impl FnOnce(&mut HashMap<String, String>) -> T) -> T {
     change(&mut STEPS.lock().unwrap_or_else(PoisonError::into_inner))
 }
 
+/// The page's name for its work.
+fn job(request: &Request) -> &str {
+    request.header("x-job").unwrap_or_default()
+}
+
 /// Work that a page waits for. `/progress` tells its steps.
 pub struct Job(String);
 
 impl Job {
     /// The work of a request, under the page's name for it.
     pub fn of(request: &Request) -> Self {
-        Self(request.job.clone().unwrap_or_default())
+        Self(job(request).to_owned())
     }
 
     /// Tells the step that begins.
@@ -227,8 +233,7 @@ impl Drop for Job {
 
 /// The step of the job that the request names; nothing if there is none.
 pub fn progress(request: &Request) -> Answer {
-    let job = request.job.as_deref().unwrap_or_default();
-    text(StatusCode::OK, &steps(|steps| steps.get(job).cloned()).unwrap_or_default())
+    text(StatusCode::OK, &steps(|steps| steps.get(job(request)).cloned()).unwrap_or_default())
 }
 
 impl From<Refusal> for Answer {

@@ -8,8 +8,6 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::say;
 
-/// Bytes between two plain lines.
-const LINE_BYTES: u64 = 500_000_000;
 /// Plain lines over all steps of a command.
 const LINES: u64 = 10;
 
@@ -23,7 +21,7 @@ pub fn shown(bar: ProgressBar, template: &str) -> Option<ProgressBar> {
 pub struct Progress {
     bar: Option<ProgressBar>,
     plain: bool,
-    /// Bytes or steps reported by the last plain line.
+    /// Steps reported by the last plain line.
     reported: Cell<u64>,
     start: Instant,
 }
@@ -34,24 +32,26 @@ impl Progress {
         Self::new(ProgressBar::new_spinner(), "{spinner} {msg} [{elapsed}]")
     }
 
-    /// Progress in bytes of a file, with rate and time left.
-    pub fn bytes() -> Self {
-        let template = "{bar:40} {bytes}/{total_bytes} {bytes_per_sec} {eta} left";
-        Self::new(ProgressBar::new(0), template)
+    /// A function that is told the numbers of finished and of all steps, with rate and time left. The progress ends when
+    /// the function is dropped.
+    pub fn counted(unit: &'static str) -> impl Fn(usize, usize) {
+        let template = format!("{{bar:40}} {{pos}}/{{len}} {unit} {{per_sec}} {{eta}} left");
+        let progress = Self::new(ProgressBar::new(0), &template);
+        move |done, total| progress.step(done, total, unit)
     }
 
-    /// Progress in equal steps of a known number, with rate and time left.
-    pub fn steps(total: usize, unit: &str) -> Self {
-        let template = format!("{{bar:40}} {{pos}}/{{len}} {unit} {{per_sec}} {{eta}} left");
-        Self::new(ProgressBar::new(total as u64), &template)
+    /// As [`Self::counted`], for finished and all bytes.
+    pub fn megabytes() -> impl Fn(u64, u64) {
+        let step = Self::counted("MB");
+        let megabytes = |bytes: u64| (bytes / 1_000_000) as usize;
+        move |done, total| step(megabytes(done), megabytes(total))
     }
 
     /// Iterates over `items` and counts each as a step when the next one is requested.
-    pub fn over<T>(items: impl ExactSizeIterator<Item = T>, unit: &str) -> impl Iterator<Item = T> {
-        let total = items.len();
-        let progress = Self::steps(total, unit);
+    pub fn over<T>(items: impl ExactSizeIterator<Item = T>, unit: &'static str) -> impl Iterator<Item = T> {
+        let (total, step) = (items.len(), Self::counted(unit));
         items.map(Some).chain([None]).enumerate().map_while(move |(done, item)| {
-            progress.step(done, total, unit);
+            step(done, total);
             item
         })
     }
@@ -73,30 +73,19 @@ impl Progress {
     }
 
     /// Reports the number of finished steps.
-    pub fn step(&self, done: usize, total: usize, unit: &str) {
+    fn step(&self, done: usize, total: usize, unit: &str) {
         let (done, total) = (done as u64, total as u64);
         if let Some(bar) = &self.bar {
             bar.set_length(total);
             bar.set_position(done);
         } else if self.plain
-            && done > 0
+            && done > self.reported.get()
             && (done == total || done >= self.reported.get() + total.div_ceil(LINES))
         {
             self.reported.set(done);
             let rate = done as f64 / self.start.elapsed().as_secs_f64();
             let left = (total - done) as f64 / rate;
             say::err(&format!("{done} of {total} {unit}, {rate:.1} a second, {left:.0} s left"));
-        }
-    }
-
-    /// Reports the number of finished bytes.
-    pub fn advance(&self, done: u64, total: u64) {
-        if let Some(bar) = &self.bar {
-            bar.set_length(total);
-            bar.set_position(done);
-        } else if self.plain && done >= self.reported.get() + LINE_BYTES {
-            self.reported.set(done);
-            say::err(&format!("{} of {} MB", done / 1_000_000, total / 1_000_000));
         }
     }
 }

@@ -131,13 +131,20 @@ pub fn nothing_left(message: &str, left_out: &[LeftOut]) -> Failure {
     Failure::Input(format!("{message}: {}", whys.join("; ")))
 }
 
+/// A word or a path as a shell takes it.
+pub fn quoted(word: &Path) -> String {
+    let text = word.display().to_string();
+    let is_plain = |c: char| c.is_alphanumeric() || "/._-+:=@%,".contains(c);
+    if !text.is_empty() && text.chars().all(is_plain) {
+        text
+    } else {
+        format!("'{}'", text.replace('\'', r"'\''"))
+    }
+}
+
 /// The header of a report, with the command line of this process.
 pub fn header(device: &str) -> Header {
-    let words = std::env::args_os().skip(1).map(|word| {
-        let word = word.to_string_lossy().into_owned();
-        let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c);
-        if !word.is_empty() && word.chars().all(plain) { word } else { format!("{word:?}") }
-    });
+    let words = std::env::args_os().skip(1).map(|word| quoted(word.as_ref()));
     Header {
         command: format!("snapsnap {}", words.collect::<Vec<_>>().join(" ")),
         commit: env!("SNAPSNAP_COMMIT").into(),

@@ -37,26 +37,19 @@ static HELD: AtomicU64 = AtomicU64::new(0);
 pub struct Request {
     /// The path, without query and fragment.
     pub path: String,
-    /// Whether it comes from this machine.
-    pub is_near: bool,
-    /// The `Host` header.
-    pub host: Option<String>,
-    /// The `Cookie` header.
-    pub cookie: Option<String>,
     /// The method, for example GET.
     pub method: String,
-    /// The `Origin` header.
-    pub origin: Option<String>,
-    /// The `Sec-Fetch-Site` header, by which a browser names the requesting page's relation to the server.
-    pub fetch_site: Option<String>,
-    /// The `X-Job` header, the page's name for its work.
-    pub job: Option<String>,
-    /// The `X-Parts` header: lengths of the body's parts.
-    pub parts: Option<String>,
-    /// The `X-Told` header: what the user says of the photographs, as JSON.
-    pub told: Option<String>,
-    /// Length of the body.
-    length: Option<u64>,
+    /// Whether it comes from this machine.
+    pub is_near: bool,
+    /// Names in lower case, and values.
+    headers: Vec<(String, String)>,
+}
+
+impl Request {
+    /// The value of the first header with this name, in lower case.
+    pub fn header(&self, name: &str) -> Option<&str> {
+        self.headers.iter().find(|(other, _)| other == name).map(|(_, value)| value.as_str())
+    }
 }
 
 /// Bytes of an answer.
@@ -183,7 +176,8 @@ pub fn serve(listener: &TcpListener, answer: &(dyn Fn(&Request, &mut Body) -> An
 fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request, &mut Body) -> Answer) -> io::Result<()> {
     let (is_head, answered) = match request(&mut stream)? {
         Ok((request, begun)) => {
-            let mut body = Body { stream: &mut stream, begun, length: request.length };
+            let length = request.header("content-length").and_then(|length| length.trim().parse().ok());
+            let mut body = Body { stream: &mut stream, begun, length };
             (request.method == "HEAD", answer(&request, &mut body))
         }
         Err((status, why)) => (false, Answer { status, headers: Vec::new(), content: Arc::new(why) }),
@@ -267,12 +261,12 @@ fn request(stream: &mut TcpStream) -> io::Result<Result<(Request, Vec<u8>), Refu
 }
 
 fn checked(parsed: &httparse::Request, is_near: bool) -> Result<Request, Refusal> {
-    let named = |name: &'static str| {
-        let found = parsed.headers.iter().filter(move |header| header.name.eq_ignore_ascii_case(name));
-        found.map(|header| String::from_utf8_lossy(header.value).into_owned())
-    };
-    let header = |name| named(name).next();
-    if named("host").count() > 1 {
+    let texts = parsed
+        .headers
+        .iter()
+        .map(|header| (header.name.to_ascii_lowercase(), String::from_utf8_lossy(header.value).into_owned()));
+    let headers: Vec<(String, String)> = texts.collect();
+    if headers.iter().filter(|(name, _)| name == "host").count() > 1 {
         return Err((StatusCode::BAD_REQUEST, "two Host headers"));
     }
     let target = parsed.path.unwrap_or_default();
@@ -280,20 +274,7 @@ fn checked(parsed: &httparse::Request, is_near: bool) -> Result<Request, Refusal
     let path =
         target.strip_prefix("http://").map_or(target, |rest| rest.find('/').map_or("/", |at| &rest[at..]));
     let path = path.split(['?', '#']).next().unwrap_or_default().to_owned();
-    let length = header("content-length").and_then(|length| length.trim().parse().ok());
-    Ok(Request {
-        path,
-        is_near,
-        host: header("host"),
-        cookie: header("cookie"),
-        method: parsed.method.unwrap_or_default().to_owned(),
-        origin: header("origin"),
-        fetch_site: header("sec-fetch-site"),
-        job: header("x-job"),
-        parts: header("x-parts"),
-        told: header("x-told"),
-        length,
-    })
+    Ok(Request { path, method: parsed.method.unwrap_or_default().to_owned(), is_near, headers })
 }
 
 #[cfg(test)]

@@ -67,10 +67,9 @@ impl Turntable {
     pub fn write(&self, gaussians: &Gaussians) -> Result<(), Failure> {
         let count = if matches!(self, Self::Sheet(_)) { SHEET } else { FRAMES };
         let orbit = Camera::orbit(count, SIZE, SIZE);
-        let progress = Progress::steps(count, "views");
-        let done = |done, all| progress.step(done, all, "views");
+        let done = Progress::counted("views");
         let pictures = views(&gaussians.clone().into(), &orbit, &RenderOptions::inria(), &done)?;
-        drop(progress);
+        drop(done);
         match self {
             Self::Gif(path) => write(path, &gif(&pictures, FRAMES_PER_SECOND)?),
             Self::Sheet(path) => write_png(path, &sheet(&pictures, SHEET_COLUMNS)),

@@ -57,13 +57,19 @@ pub fn is_ending() -> bool {
 /// # Errors
 /// The operating system's refusal, or [`io::ErrorKind::Interrupted`] after [`remove_unfinished`].
 pub fn unfinished_folder(path: &Path) -> io::Result<Watch> {
+    begun(path, || fs::create_dir_all(path))?;
+    Ok(Watch(path.to_owned()))
+}
+
+/// Makes a file or a folder and registers it for [`remove_unfinished`], under one lock.
+fn begun<T>(path: &Path, make: impl FnOnce() -> io::Result<T>) -> io::Result<T> {
     let mut unfinished = unfinished();
     if unfinished.ending {
         return Err(io::Error::new(io::ErrorKind::Interrupted, "the program is being ended"));
     }
-    fs::create_dir_all(path)?;
+    let made = make()?;
     unfinished.paths.push(path.to_owned());
-    Ok(Watch(path.to_owned()))
+    Ok(made)
 }
 
 /// Guard of an unfinished folder or file. When the guard is dropped, [`remove_unfinished`] no longer removes the path.
@@ -90,15 +96,9 @@ pub fn unfinished_file(path: &Path) -> Watch {
     Watch(path.to_owned())
 }
 
-/// Creates a temporary file and registers it for [`remove_unfinished`], under one lock.
+/// Creates a temporary file.
 fn create(path: &Path) -> io::Result<File> {
-    let mut unfinished = unfinished();
-    if unfinished.ending {
-        return Err(io::Error::new(io::ErrorKind::Interrupted, "the program is being ended"));
-    }
-    let mut options = File::options();
-    options.read(true).write(true).create_new(true);
-    let file = options.open(path)?;
+    let file = File::options().read(true).write(true).create_new(true).open(path)?;
     // The lock distinguishes the file of a running process from a file that a killed run has left. Some file systems
     // have no locks.
     let _ = file.lock();
@@ -106,7 +106,6 @@ fn create(path: &Path) -> io::Result<File> {
     if !path.exists() {
         return Err(io::ErrorKind::AlreadyExists.into());
     }
-    unfinished.paths.push(path.to_owned());
     Ok(file)
 }
 
@@ -186,7 +185,7 @@ pub fn write_whole<E: From<io::Error>>(
     // Created with the mode of an ordinary new file (the umask applies), not the private one of temporary files.
     let mut file = tempfile::Builder::new()
         .prefix(PREFIX)
-        .make_in(folder_of(path), create)
+        .make_in(folder_of(path), |path| begun(path, || create(path)))
         .map_err(|e| io::Error::from(e.kind()))?;
     if let Some(permissions) = permissions
         && file.as_file().metadata()?.permissions() != permissions

@@ -2,9 +2,9 @@
 
 use std::fs;
 
-use snapsnap_tests::{refused, snapsnap, succeed};
+use snapsnap_tests::{ended_with, refused, snapsnap, succeed};
 
-use super::{ended, json, people, weights};
+use super::{json, people, weights};
 
 const CONFIG: &str = r#"
 [bench]
@@ -63,13 +63,15 @@ fn every_setting_is_measured_with_its_omissions() {
     assert!(!report.join("training_points.svg").exists());
 
     // A setting and a run that fail are named, and the others are measured.
-    let (code, said) =
-        ended(&mut bench(&["--set", "settings.odd.set=[\"network.resolution=100\"]", "--runs", "nowhere"]));
-    assert!(code == Some(1) && said.contains("odd") && said.contains("nowhere"), "{said}");
+    let said = ended_with(
+        1,
+        &mut bench(&["--set", "settings.odd.set=[\"network.resolution=100\"]", "--runs", "nowhere"]),
+    );
+    assert!(said.contains("odd") && said.contains("nowhere"), "{said}");
     assert_eq!(json(&report)["settings"].as_array().map(Vec::len), Some(3));
     // A setting can have its own data set.
-    let (code, said) = ended(&mut bench(&["--set", "settings.elsewhere.data=\"no/people\""]));
-    assert!(code == Some(1) && said.contains("elsewhere") && said.contains("no/people"), "{said}");
+    let said = ended_with(1, &mut bench(&["--set", "settings.elsewhere.data=\"no/people\""]));
+    assert!(said.contains("elsewhere") && said.contains("no/people"), "{said}");
     assert!(refused(&mut bench(&["--set", "bench.runs=0"])).contains("bench.runs"));
     assert!(refused(&mut bench(&["--set", "settings.a.stride=0"])).contains("stride"));
     assert!(refused(&mut bench(&["--set", "settings.a.inputs=[0]"])).contains("settings.a.inputs"));

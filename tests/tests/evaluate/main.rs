@@ -8,7 +8,7 @@ mod stability;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Command;
 use std::sync::OnceLock;
 
 use serde_json::Value;
@@ -76,12 +76,4 @@ fn evaluate(data: &Path, report: &Path, arguments: &[&str]) -> Command {
 fn json(report: &Path) -> Value {
     let text = fs::read_to_string(report.join("report.json")).expect("a report");
     serde_json::from_str(&text).expect("JSON")
-}
-
-/// Exit code and stderr of a command.
-fn ended(command: &mut Command) -> (Option<i32>, String) {
-    let Output { status, stderr, .. } = command.output().expect("the program starts");
-    let said = String::from_utf8_lossy(&stderr).into_owned();
-    assert!(!said.contains("panicked"), "{said}");
-    (status.code(), said)
 }

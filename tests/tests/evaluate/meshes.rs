@@ -3,9 +3,9 @@
 use std::fs;
 use std::path::Path;
 
-use snapsnap_tests::{snapsnap, succeed};
+use snapsnap_tests::{ended, ended_with, snapsnap, succeed};
 
-use super::{ended, evaluate, evaluation, json, people};
+use super::{evaluate, evaluation, json, people};
 
 #[test]
 fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
@@ -24,8 +24,8 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
     fs::write(meshes.join("0001.obj"), lines.collect::<Vec<_>>().join("\n") + "\n").expect("writes");
     let run = |icp: &[&str]| {
         let mut command = evaluation(&[people()], &report);
-        let (code, said) = ended(command.arg("--mesh-dir").arg(&meshes).args(icp));
-        assert!(code == Some(1) && said.contains("0000") && said.contains("has no mesh"), "{said}");
+        let said = ended_with(1, command.arg("--mesh-dir").arg(&meshes).args(icp));
+        assert!(said.contains("0000") && said.contains("has no mesh"), "{said}");
         let found = json(&report);
         assert_eq!(
             (found["people"].as_u64(), found["left_out"].as_array().map(Vec::len)),
@@ -41,8 +41,7 @@ fn a_mesh_is_as_far_from_the_truth_as_it_was_moved_until_it_is_aligned() {
     assert!(aligned[0].as_f64().is_some_and(|degrees| (degrees - 4.0).abs() < 1.5), "{aligned}");
     let text = fs::read_to_string(report.join("report.md")).expect("a report");
     assert!(text.contains("rigid, by iterated closest points"), "{text}");
-    // The option's former name, with a value.
-    let (_, _, scaled) = run(&["--icp", "similarity"]);
+    let (_, _, scaled) = run(&["--align", "similarity"]);
     assert!(scaled[2].as_f64().is_some_and(|scale| (scale - 1.0).abs() < 0.03 && scale != 1.0), "{scaled}");
 }
 
@@ -94,8 +93,7 @@ fn meshes_of_two_data_sets_are_told_apart() {
     super::copied(&around);
     fs::write(meshes.join("around/people/0001.obj"), &scan).expect("writes");
     let mut command = evaluation(&[Path::new("people"), &other], &report);
-    let (code, said) = ended(command.current_dir(&around).arg("--mesh-dir").arg(&meshes));
-    assert_eq!(code, Some(1), "{said}");
+    ended_with(1, command.current_dir(&around).arg("--mesh-dir").arg(&meshes));
     assert_eq!(json(&report)["subjects"][0]["name"], "around/people/0001");
 }
 

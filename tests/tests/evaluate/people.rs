@@ -7,9 +7,9 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 
 use serde_json::Value;
-use snapsnap_tests::{refused, root, snapsnap, succeed};
+use snapsnap_tests::{ended_with, refused, root, snapsnap, succeed};
 
-use super::{copied, ended, evaluate, json, people, weights};
+use super::{copied, evaluate, json, people, weights};
 
 /// The program's own weights on people in a ring of views.
 #[test]
@@ -190,8 +190,7 @@ fn networks_of_neighbours_are_refused_for_other_photographs() {
     };
     // Eight views.
     succeed(&mut run("quarters", "[0, 2, 4, 6]"));
-    let (status, said) = ended(&mut run("others", "[0, 3, 6]"));
-    assert_eq!(status, Some(1));
+    let said = ended_with(1, &mut run("others", "[0, 3, 6]"));
     assert!(
         said.contains("135.0° apart") && said.contains("`network.pair_degrees` of the weights is 90"),
         "{said}"
@@ -249,12 +248,14 @@ fn missing_and_damaged_parts_are_named_and_the_rest_evaluated() {
             .collect()
     };
     // A missing person and missing weights.
-    let (code, said) = ended(&mut evaluate(
-        people(),
-        &report,
-        &["--set", "data.only=[\"0001\", \"0815\"]", "--against", "nowhere.safetensors"],
-    ));
-    assert_eq!(code, Some(1), "{said}");
+    let said = ended_with(
+        1,
+        &mut evaluate(
+            people(),
+            &report,
+            &["--set", "data.only=[\"0001\", \"0815\"]", "--against", "nowhere.safetensors"],
+        ),
+    );
     let found = json(&report);
     assert_eq!(found["protocols"]["paper"]["people"].as_u64(), Some(1));
     let all = left_out(&found);
@@ -263,8 +264,8 @@ fn missing_and_damaged_parts_are_named_and_the_rest_evaluated() {
     assert!(said.contains("0815") && said.contains("nowhere.safetensors"), "{said}");
 
     // No compared view.
-    let (code, said) = ended(&mut evaluate(people(), &report, &["--set", "views.compared=[0, 4]"]));
-    assert!(code == Some(1) && said.contains("no view is left"), "{said}");
+    let said = ended_with(1, &mut evaluate(people(), &report, &["--set", "views.compared=[0, 4]"]));
+    assert!(said.contains("no view is left"), "{said}");
 
     // A truncated picture, a view without its camera, a picture of another size.
     let data = copied(temporary.path());
@@ -277,8 +278,7 @@ fn missing_and_damaged_parts_are_named_and_the_rest_evaluated() {
     let list: Vec<Value> =
         serde_json::from_str(&fs::read_to_string(&cameras).expect("cameras")).expect("JSON");
     fs::write(&cameras, serde_json::to_string(&list[..7]).expect("JSON")).expect("writes");
-    let (code, said) = ended(&mut evaluate(&data, &report, &["--set", "metrics.geometry=false"]));
-    assert_eq!(code, Some(1), "{said}");
+    ended_with(1, &mut evaluate(&data, &report, &["--set", "metrics.geometry=false"]));
     let found = json(&report);
     assert_eq!(
         (found["protocols"]["paper"]["people"].as_u64(), found["protocols"]["paper"]["views"].as_u64()),
@@ -308,15 +308,15 @@ fn missing_and_damaged_parts_are_named_and_the_rest_evaluated() {
     }
     fs::write(&cameras, serde_json::to_string(&list).expect("JSON")).expect("writes");
     fs::remove_file(data.join("test/depth/0000/0.npz")).expect("removes");
-    let (code, said) = ended(&mut evaluate(&data, &report, &["--set", "metrics.geometry=false"]));
-    assert!(code == Some(1) && said.contains("the camera of view 2 is a reflection"), "{said}");
+    let said = ended_with(1, &mut evaluate(&data, &report, &["--set", "metrics.geometry=false"]));
+    assert!(said.contains("the camera of view 2 is a reflection"), "{said}");
     let found = json(&report);
     assert_eq!(found["protocols"]["masked"]["views"].as_u64(), Some(6), "{said}");
     assert!(left_out(&found).iter().any(|entry| entry.starts_with("0000, model, points: ")), "{said}");
 
     // Baselines are evaluated without weights.
-    let (code, said) = ended(&mut evaluate(people(), &report, &["--weights", "nowhere.safetensors"]));
-    assert!(code == Some(1) && said.contains("nowhere.safetensors"), "{said}");
+    let said = ended_with(1, &mut evaluate(people(), &report, &["--weights", "nowhere.safetensors"]));
+    assert!(said.contains("nowhere.safetensors"), "{said}");
     let found = json(&report);
     assert_eq!(found["protocols"], serde_json::json!({}));
     assert!(found["baselines"]["billboard"]["paper"]["psnr"]["mean"].is_number());
@@ -345,8 +345,7 @@ fn a_prediction_that_is_not_finite_is_counted() {
     snapsnap_tests::fill_weights(&file, 1e30);
     let file = file.display().to_string();
     let arguments = ["--set", "metrics.geometry=false", "--weights", file.as_str()];
-    let (code, said) = ended(&mut evaluate(people(), &report, &arguments));
-    assert_eq!(code, Some(1), "{said}");
+    let said = ended_with(1, &mut evaluate(people(), &report, &arguments));
     assert!(said.contains("not finite") || said.contains("no Gaussian came out"), "{said}");
     assert!(json(&report)["baselines"]["billboard"]["paper"]["psnr"]["mean"].is_number());
 }

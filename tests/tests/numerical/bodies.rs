@@ -6,7 +6,7 @@ use snapsnap_net::network::{Input, PointMap, PointPredictor, View};
 use snapsnap_net::steps::Step;
 use snapsnap_net::weights::random_predictor;
 use snapsnap_net::{Reconstruction, Reconstructor, Window};
-use snapsnap_tests::{device, is_software, relative_error, values};
+use snapsnap_tests::{device, real_device, relative_error, values};
 
 use crate::properties::{assert_different, assert_same, config, noise, photograph, weights};
 
@@ -16,16 +16,6 @@ const CONVOLUTION: [&str; 4] = [
     "network.mask_channel=true",
     "network.ray_channels=true",
 ];
-
-/// The device, unless it is a software adapter, which compiles kernels for minutes.
-fn real_device() -> Option<Device> {
-    let device = device()?;
-    if is_software(&device) {
-        println!("SKIPPED: on a software adapter this takes minutes");
-        return None;
-    }
-    Some(device)
-}
 
 fn images([h, w]: [usize; 2], channels: usize, seed: u32, device: &Device) -> Tensor<4> {
     Tensor::from_data(TensorData::new(noise(2 * channels * h * w, seed), [2, channels, h, w]), device)

@@ -1,11 +1,9 @@
 //! The whole inference through the command line, from the authors' checkpoints to the Gaussians, against the authors'
 //! numbers. The data are in this repository.
 
-use std::path::Path;
-use std::process::Command;
-
 use image::{GrayImage, RgbImage};
-use snapsnap_tests::{Numbers, data, device, device_name, relative_error, snapsnap, succeed, toml_config};
+use snapsnap_tests::workplace::Workplace;
+use snapsnap_tests::{Numbers, data, device, device_name, relative_error, succeed, toml_config};
 
 /// Relative L2 error of points and attributes.
 const BOUND: f64 = 1e-4;
@@ -15,9 +13,8 @@ const THRESHOLD: f32 = 0.9;
 /// Largest number of side pixels with the colour of another, equally near neighbour. Random weights give a few ties.
 const MOST_TIES: usize = 4;
 
-/// The fixture's pictures as files; returns the arguments that name them.
-fn pictures(numbers: &Numbers, folder: &Path) -> Vec<String> {
-    let path = |name: &str| folder.join(name).display().to_string();
+/// Writes the fixture's pictures and masks.
+fn pictures(numbers: &Numbers, place: &Workplace) {
     for side in ["front", "back"] {
         let (shape, rgb) = numbers.u8(&format!("{side}_rgb"));
         let (h, w) = (shape[1], shape[2]);
@@ -25,24 +22,13 @@ fn pictures(numbers: &Numbers, folder: &Path) -> Vec<String> {
             let at = y as usize * w + x as usize;
             image::Rgb([rgb[at], rgb[h * w + at], rgb[2 * h * w + at]])
         };
-        RgbImage::from_fn(w as u32, h as u32, pixel).save(path(&format!("{side}.png"))).expect("PNG");
+        RgbImage::from_fn(w as u32, h as u32, pixel).save(place.path(&format!("{side}.png"))).expect("PNG");
         let (_, mask) = numbers.u8(&format!("{side}_mask"));
         let high = if mask.iter().all(|v| *v <= 1) { 255 } else { 1 };
         let mask = mask.iter().map(|v| v * high).collect();
         let mask = GrayImage::from_raw(w as u32, h as u32, mask).expect("as many values as pixels");
-        mask.save(path(&format!("{side}_mask.png"))).expect("PNG");
+        mask.save(place.path(&format!("{side}_mask.png"))).expect("PNG");
     }
-    ["front.png", "back.png", "--masks", "front_mask.png", "back_mask.png"]
-        .map(|a| if a.starts_with('-') { a.into() } else { path(a) })
-        .to_vec()
-}
-
-fn cli_device() -> String {
-    if device_name() == "flex" { "cpu".into() } else { device_name() }
-}
-
-fn run(arguments: &mut Command) -> String {
-    succeed(arguments.arg("--quiet"))
 }
 
 #[test]
@@ -51,30 +37,17 @@ fn authors_checkpoints_give_the_authors_gaussians() {
         return;
     }
     let source = data("pipeline");
-    let temporary = tempfile::tempdir().expect("temporary folder");
-    let folder = temporary.path();
-    let config = folder.join("config.toml");
-    std::fs::write(&config, toml_config(&source.join("config.json"))).expect("write");
-    let weights = folder.join("weights.safetensors");
-    run(snapsnap()
-        .arg("import-weights")
-        .args([source.join("stage1.pth"), source.join("stage2.pth")])
-        .arg("--config")
-        .arg(&config)
-        .arg("-o")
-        .arg(&weights));
+    let place = Workplace::empty();
+    place.write("config.toml", toml_config(&source.join("config.json")));
+    let checkpoints = ["stage1.pth", "stage2.pth"].map(|name| source.join(name));
+    succeed(place.run("import-weights --quiet --config config.toml -o w").args(checkpoints));
     let expected = Numbers::read(&source.join("pipeline.safetensors"));
-    let dump = folder.join("dump.safetensors");
-    run(snapsnap()
-        .arg("reconstruct")
-        .args(pictures(&expected, folder))
-        .args(["--as-is", "--device", &cli_device(), "--weights"])
-        .arg(&weights)
-        .arg("--dump")
-        .arg(&dump)
-        .arg("-o")
-        .arg(folder.join("human.ply")));
-    compare(&Numbers::read(&dump), &expected);
+    pictures(&expected, &place);
+    let device = device_name().replace("flex", "cpu");
+    let line =
+        "front.png back.png --masks front_mask.png back_mask.png --as-is --weights w --dump dump --quiet";
+    succeed(&mut place.run(&format!("reconstruct {line} --device {device}")));
+    compare(&Numbers::read(&place.path("dump")), &expected);
 }
 
 fn compare(got: &Numbers, expected: &Numbers) {

@@ -142,21 +142,6 @@ fn nothing_to_see_leaves_the_background() {
 }
 
 #[test]
-fn the_image_is_linear_in_the_background() {
-    let Some(device) = device() else { return };
-    let mut host = random_scene(40, 8);
-    let camera = [forward_camera(40, 30)];
-    let mut image = |background: [f32; 3]| {
-        host.background = background;
-        pass(&host, &camera, &RenderOptions::inria(), &device).image
-    };
-    let (black, one, two) = (image([0.0; 3]), image([1.0, 0.5, 0.25]), image([2.0, 1.0, 0.5]));
-    for ((b, o), t) in black.iter().zip(&one).zip(&two) {
-        assert!((t - b - 2.0 * (o - b)).abs() < 1e-6, "{b} {o} {t}");
-    }
-}
-
-#[test]
 fn several_views_are_the_same_as_each_alone() {
     let Some(device) = device() else { return };
     let host = random_scene(60, 9);

@@ -16,7 +16,7 @@ use snapsnap_net::network::{PointMap, View, activate};
 use snapsnap_net::weights::{random_predictor, random_regressors};
 use snapsnap_net::{Prediction, Window};
 use snapsnap_people::{Detail, synth};
-use snapsnap_tests::{TRAINING, device, device_name, is_software, relative_error, values};
+use snapsnap_tests::{TRAINING, device, device_name, is_software, real_device, relative_error, values};
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::gradients;
 use snapsnap_train::networks::{Networks, Rows};
@@ -208,11 +208,7 @@ fn a_step_of_stage_2_is_the_same_on_every_device() {
 /// Losses and gradients of a predictor in 16 bits are those in 32 bits, but for rounding.
 #[test]
 fn sixteen_bits_have_the_same_gradients_but_for_rounding() {
-    let Some(device) = device() else { return };
-    if is_software(&device) {
-        println!("SKIPPED: on a software adapter this takes minutes");
-        return;
-    }
+    let Some(device) = real_device() else { return };
     let temporary = tempfile::tempdir().expect("temporary folder");
     let (folder, config, device) = (people(temporary.path()), config(), device.autodiff());
     let predictor = Some(random_predictor(&config.networks(), 3, &device));

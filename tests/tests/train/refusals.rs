@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use std::{fs, thread};
 
 use snapsnap_net::weights::Source;
-use snapsnap_tests::{copy_folder, files, fill_weights, refused, succeed, synthetic_people};
+use snapsnap_tests::{copy_folder, ended_with, files, fill_weights, refused, succeed, synthetic_people};
 
 use super::{logged, people, place, results, train, train_on};
 
@@ -245,9 +245,8 @@ fn the_best_validation_counts_for_later_people() {
     copy_folder(people(), &training_alone);
     fs::remove_dir_all(training_alone.join("val")).expect("removes");
     succeed(&mut generation(&training_alone, "--set=training.steps=4"));
-    let output = generation(&other, "--set=training.steps=6").output().expect("runs");
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && !said.contains("counts no longer"), "{said}");
+    let said = ended_with(0, &mut generation(&other, "--set=training.steps=6"));
+    assert!(!said.contains("counts no longer"), "{said}");
     assert_eq!(logged(&run, "validation/points_mm").last().expect("a validation").0, 6);
     let said = refused(&mut train_on(&held, 1, &config, &temporary.path().join("none")));
     assert!(said.contains("no data set has people of the split train"), "{said}");
@@ -297,9 +296,8 @@ fn stage_2_continues_with_its_own_predictor_only() {
         command
     };
     succeed(&mut trained("--set=training.steps=2", &weights(0)));
-    let output = trained("--set=training.steps=3", &weights(1)).output().expect("runs");
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && said.contains("--weights is not read"), "{said}");
+    let said = ended_with(0, &mut trained("--set=training.steps=3", &weights(1)));
+    assert!(said.contains("--weights is not read"), "{said}");
     let written = fs::read_to_string(joint.join("config.toml")).expect("a config");
     assert!(written.contains(&format!("{:?}", weights(0).display().to_string())), "{written}");
     fs::copy(weights(0), run.join("last.safetensors")).expect("copies");

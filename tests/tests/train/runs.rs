@@ -11,7 +11,9 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     let (temporary, config) = place();
     let (one, two) = (temporary.path().join("one"), temporary.path().join("two"));
     let said = succeed(&mut train(1, &config, &one));
-    assert!(said.contains("finished after 40 steps") && said.contains("a training of stage 2"), "{said}");
+    let weights = one.join("best.safetensors");
+    let next = format!("a training of stage 2, which begins with --weights {}", weights.display());
+    assert!(said.contains("finished after 40 steps") && said.contains(&next), "{said}");
     let losses = logged(&one, "loss");
     assert_eq!(losses.len(), 40);
     let mean = |part: &[(u64, f64)]| part.iter().map(|(_, loss)| loss).sum::<f64>() / part.len() as f64;
@@ -36,34 +38,16 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
         assert!(svg.contains(part), "{part}: {svg}");
     }
 
-    // The printed commands run as they are.
-    let weights = one.join("best.safetensors");
-    let next = |said: &str| {
-        said.lines().find_map(|line| line.strip_prefix("next:")).expect("a command").trim().to_owned()
-    };
-    let command = next(&said);
-    // There is no config of stage 2 beside the config of stage 1.
-    let expected = format!("a training of stage 2, which begins with --weights {}", weights.display());
-    assert!(command.contains(&expected), "{command}");
-    let [first, second] = ["stage1.toml", "stage2.toml"].map(|name| temporary.path().join(name));
-    for path in [&first, &second] {
-        fs::copy(&config, path).expect("copies");
-    }
-    let command = next(&succeed(train(1, &first, &one).arg("--resume")));
-    for part in [&*second, &*weights, people()] {
-        assert!(
-            command.starts_with("snapsnap train-stage2") && command.contains(&part.display().to_string()),
-            "{command}"
-        );
-    }
+    // The printed command runs as it is, but for the photographs. The file of stage 2 contains both networks.
     let said = succeed(train(2, &config, &two).arg("--weights").arg(&weights));
-    let command = next(&said);
-    assert!(!command.contains("FRONT"), "{command}");
-    let program = snapsnap().get_program().to_owned();
-    let mut shell = std::process::Command::new("sh");
-    shell.current_dir(temporary.path()).arg("-c");
-    succeed(shell.arg(command.replacen("snapsnap", &program.to_string_lossy(), 1)));
+    let command = said.lines().find_map(|line| line.strip_prefix("next:")).expect("a command").trim();
+    let photographs = [0, 2].map(|view| people().join(format!("val/img/0000/{view}.png")));
+    let photographs = photographs.map(|path| path.display().to_string()).join(" ");
+    let program = snapsnap().get_program().to_string_lossy().into_owned();
+    let command = command.replacen("snapsnap", &program, 1).replacen("FRONT BACK", &photographs, 1);
+    succeed(std::process::Command::new("sh").current_dir(temporary.path()).arg("-c").arg(command));
     assert!(temporary.path().join("turn.png").is_file());
+    assert!(fs::metadata(temporary.path().join("human.ply")).expect("a file").len() > 10_000);
     assert_eq!(logged(&two, "validation/psnr_masked").len(), 4);
 
     // Stage 1 ignores the regressor of a weight file. Stage 2 checks the regressor's config.
@@ -77,14 +61,6 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     succeed(train(1, &config, &temporary.path().join("three")).args(other).arg(&both));
     let said = refused(train(2, &config, &temporary.path().join("four")).args(other).arg(&both));
     assert!(said.contains("`regressor.start`") && said.contains("`import-weights --set`"), "{said}");
-
-    // The file of stage 2 contains both networks.
-    let view = |view: u32| people().join(format!("val/img/0000/{view}.png"));
-    let ply = temporary.path().join("human.ply");
-    let mut command = snapsnap();
-    command.arg("reconstruct").arg(view(0)).arg(view(2)).args(["--as-is", "--device", "cpu", "--weights"]);
-    succeed(command.arg(two.join("last.safetensors")).arg("-o").arg(&ply));
-    assert!(fs::metadata(&ply).expect("a file").len() > 10_000);
 }
 
 /// All other layers keep the values that the run begins with.

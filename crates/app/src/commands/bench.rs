@@ -1,6 +1,6 @@
 //! `snapsnap bench`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::Command;
 
 use clap::Args;
@@ -10,7 +10,7 @@ use snapsnap_eval::bench::report::{Bench, Training};
 use snapsnap_eval::bench::{Measured, dominated, measure};
 use snapsnap_eval::evaluate::LeftOut;
 
-use super::evaluate::{check_data, opened};
+use super::evaluate::{check_data, inputs, opened};
 use crate::arguments::check_utf8;
 use crate::failure::Failure;
 use crate::output::outside_data;
@@ -64,18 +64,13 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let variants = config.variants();
     let own = variants.iter().filter_map(|(_, variant)| variant.data.as_ref());
     outside_data(output, config.data.folders.iter().chain(own).map(PathBuf::as_path))?;
-    let inputs: Vec<&Path> = std::iter::once(&arguments.config)
-        .chain(variants.iter().filter_map(|(_, variant)| variant.weights.as_ref()))
-        .chain(&arguments.lpips.files)
-        .map(PathBuf::as_path)
-        .collect();
     // One error instead of one for each setting.
     if let Some(path) = &config.model.weights
         && let Err(e) = path.metadata()
     {
         return Err(Failure::file(path, format_args!("cannot read: {e}")));
     }
-    let folder = ReportFolder::new(output, &inputs)?;
+    let folder = ReportFolder::new(output, &inputs(&arguments.config, &variants, &arguments.lpips))?;
     let (mut left_out, mut training, mut measured) = (Vec::new(), Vec::new(), Vec::new());
     for run in &config.training.runs {
         match Training::read(run) {

@@ -47,13 +47,13 @@ pub struct Arguments {
     against: Option<PathBuf>,
     /// Also evaluate the model on changed photographs. grey: every pixel of the person gets the person's mean colour,
     /// so that only the outline is left.
-    #[arg(long, value_parser = one_of(INPUTS), value_name = "KIND", conflicts_with = "mesh_dir")]
-    inputs: Option<bool>,
+    #[arg(long, value_parser = ["grey"], value_name = "KIND", conflicts_with = "mesh_dir")]
+    inputs: Option<String>,
     /// Evaluate the meshes NAME.obj, .ply or .glb in this folder instead of weights.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["weights", "against"])]
     mesh_dir: Option<PathBuf>,
     /// Align models or meshes with the ground truth first: turned and moved (rigid), or scaled as well (similarity).
-    #[arg(long, alias = "icp", value_parser = one_of(ALIGN), value_name = "HOW", num_args = 0..=1)]
+    #[arg(long, value_parser = one_of(ALIGN), value_name = "HOW", num_args = 0..=1)]
     #[arg(default_missing_value = "rigid")]
     align: Option<Align>,
     #[command(flatten)]
@@ -68,8 +68,6 @@ pub struct Arguments {
 
 const ALIGN: [(&str, &str, Align); 3] =
     [("none", "", Align::None), ("rigid", "", Align::Rigid), ("similarity", "", Align::Similarity)];
-/// Kinds of photographs, and whether they are grey.
-const INPUTS: [(&str, &str, bool); 1] = [("grey", "", true)];
 /// The end of the message about failed parts.
 const REST: &str = "the rest, if there is any, was evaluated";
 
@@ -84,11 +82,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let name = arguments.device.as_deref().or(config.model.device.as_deref()).unwrap_or("auto");
     let device = device::choose(name)?;
     let variants = config.variants(name);
-    let inputs: Vec<&Path> = std::iter::once(&arguments.config)
-        .chain(variants.iter().filter_map(|(_, variant)| variant.weights.as_ref()))
-        .chain(&arguments.lpips.files)
-        .map(PathBuf::as_path)
-        .collect();
+    let inputs = inputs(&arguments.config, &variants, &arguments.lpips);
     let lpips = arguments.lpips.load(&config.metrics.lpips, name)?;
     let contestants = contestants(&config, &variants, &device, &mut missing);
     if contestants.is_empty() {
@@ -96,11 +90,9 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     }
     let folder = ReportFolder::new(&arguments.output, &inputs)?;
 
-    let people = sets.iter().map(|set| set.chosen.len()).sum();
-    let progress = Progress::steps(people, "people");
-    let done = |done: usize, total: usize| progress.step(done, total, "people");
     let start = Instant::now();
-    let mut outcome = evaluate(&config, &sets, &contestants, lpips.as_ref().ok(), &done);
+    let progress = Progress::counted("people");
+    let mut outcome = evaluate(&config, &sets, &contestants, lpips.as_ref().ok(), &progress);
     let cost = Cost { seconds: start.elapsed().as_secs_f64(), memory: memory::most_used() };
     drop(progress);
     outcome.left_out.splice(0..0, missing);
@@ -130,6 +122,17 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     summarise(&json);
     say::info(&format!("{}: report.md, report.json, pictures and tables", folder.path.display()));
     complete(&report.outcome.left_out, REST)
+}
+
+/// Files that a report must not replace.
+pub(super) fn inputs<'a>(
+    config: &'a Path,
+    variants: &'a [(String, Variant)],
+    lpips: &'a perceptual::Arguments,
+) -> Vec<&'a Path> {
+    let weights = variants.iter().filter_map(|(_, variant)| variant.weights.as_ref());
+    let files = weights.chain(&lpips.files).map(PathBuf::as_path);
+    std::iter::once(config).chain(files).collect()
 }
 
 /// Refuses a config without data sets.
@@ -175,11 +178,7 @@ fn judge_meshes(
     }
     let folder = ReportFolder::new(&arguments.output, &[&arguments.config])?;
     let alignment = config.metrics.align.description();
-    let total = sets.iter().map(|set| set.chosen.len()).sum();
-    let progress = Progress::steps(total, "people");
-    let done = |done: usize, total: usize| progress.step(done, total, "people");
-    let (figures, mut left_out) = evaluate_meshes(config, sets, meshes, &done);
-    drop(progress);
+    let (figures, mut left_out) = evaluate_meshes(config, sets, meshes, &Progress::counted("people"));
     left_out.splice(0..0, missing);
     let header = header("cpu");
     folder.text("config.toml", &config.to_toml())?;
@@ -207,8 +206,8 @@ fn config_of(arguments: &Arguments) -> Result<EvalConfig, Failure> {
     if let Some(align) = arguments.align {
         config.metrics.align = align;
     }
-    if let Some(grey) = arguments.inputs {
-        let photographs = Some(PhotographChanges { grey, ..config.photographs });
+    if arguments.inputs.is_some() {
+        let photographs = Some(PhotographChanges { grey: true, ..config.photographs });
         config.ablations.insert("grey".into(), Variant { photographs, ..Variant::default() });
     }
     check_utf8(config.data.folders.iter().chain(&config.model.weights).chain(&arguments.against))?;

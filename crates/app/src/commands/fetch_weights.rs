@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use snapsnap_base::{FileError, file};
 use snapsnap_eval::lpips;
 
@@ -25,9 +25,10 @@ const REFUSED: i32 = 22;
 
 #[derive(Args)]
 pub struct Arguments {
-    /// Names to fetch [default: all].
-    #[arg(value_enum)]
-    what: Vec<Name>,
+    /// Names to fetch: dust3r, the initial weights of the paper's training, for `import-weights`; alexnet and lpips, the
+    /// network and the learned layers of LPIPS [default: all].
+    #[arg(value_parser = ITEMS.map(|item| item.name))]
+    what: Vec<String>,
     /// A folder with the files, or the address of a mirror, instead of the published addresses.
     #[arg(long, value_name = "DIR|URL")]
     from: Option<String>,
@@ -39,19 +40,9 @@ pub struct Arguments {
     list: bool,
 }
 
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Name {
-    /// DUSt3R, for `import-weights`: the initial weights of the paper's training.
-    Dust3r,
-    /// The network of LPIPS.
-    Alexnet,
-    /// The learned layers of LPIPS.
-    Lpips,
-}
-
 /// A published file.
 struct Item {
-    name: Name,
+    name: &'static str,
     /// File name, also on mirrors.
     file: &'static str,
     url: &'static str,
@@ -64,7 +55,7 @@ struct Item {
 /// them. AlexNet's name contains the first eight digits of its sum.
 const ITEMS: [Item; 3] = [
     Item {
-        name: Name::Dust3r,
+        name: "dust3r",
         file: "DUSt3R_ViTLarge_BaseDecoder_512_dpt.safetensors",
         url: "https://huggingface.co/naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt/resolve/\
               61c57447d7b0adc8a1a30b2b0adec7a8935aa2a3/model.safetensors",
@@ -73,7 +64,7 @@ const ITEMS: [Item; 3] = [
         licence: "CC BY-NC-SA 4.0 (no commercial use), and the terms of the data that it was trained on",
     },
     Item {
-        name: Name::Alexnet,
+        name: "alexnet",
         file: lpips::PUBLISHED[0],
         url: "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
         bytes: 244_408_911,
@@ -81,7 +72,7 @@ const ITEMS: [Item; 3] = [
         licence: "BSD-3-Clause (torchvision); trained on ImageNet",
     },
     Item {
-        name: Name::Lpips,
+        name: "lpips",
         file: lpips::PUBLISHED[1],
         url: "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/alex.pth",
         bytes: 6_009,
@@ -93,7 +84,7 @@ const ITEMS: [Item; 3] = [
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let wanted: Vec<(&Item, String)> = ITEMS
         .iter()
-        .filter(|item| arguments.what.is_empty() || arguments.what.contains(&item.name))
+        .filter(|item| arguments.what.is_empty() || arguments.what.iter().any(|name| name == item.name))
         .map(|item| (item, origin(arguments, item)))
         .collect();
     let lines = wanted.iter().map(|(Item { file, bytes, sha256, licence, .. }, origin)| {
@@ -170,7 +161,7 @@ fn copy(item: &Item, folder: &Path, path: &Path) -> Result<(), Failure> {
 fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
     let part = path.with_file_name(format!("{}.part", item.file));
     // A file of another kind with that name is left alone.
-    if part.symlink_metadata().is_ok_and(|there| !there.is_file() || is_shared(&there)) {
+    if part.symlink_metadata().is_ok_and(|there| !there.is_file()) {
         let message = "is no unfinished download, but a link or a special file: move it away";
         return Err(Failure::file(&part, message));
     }
@@ -192,17 +183,6 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
         broken(&part, &e)
     })?;
     file::rename(&part, path).map_err(|e| Failure::cannot_write(path, &e))
-}
-
-/// Whether a file has another name as well.
-#[cfg(unix)]
-fn is_shared(file: &fs::Metadata) -> bool {
-    std::os::unix::fs::MetadataExt::nlink(file) > 1
-}
-
-#[cfg(not(unix))]
-fn is_shared(_: &fs::Metadata) -> bool {
-    false
 }
 
 /// Why a file was not written.

@@ -7,7 +7,6 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 
 use serde::{Deserialize, Serialize};
-use snapsnap_base::config::{differences, keys};
 use snapsnap_base::{FileError, file};
 use snapsnap_mesh::picture;
 use snapsnap_net::Reconstructor;
@@ -84,7 +83,7 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
         return batch.end(0);
     }
     output::write(&path, toml::to_string_pretty(&settings).expect("TOML types").as_bytes())?;
-    let progress = Progress::steps(jobs.len(), "people");
+    let progress = Progress::counted("people");
     let (to_networks, photographs) = sync_channel(1);
     let (to_writer, people) = sync_channel(1);
     let (to_list, ended) = sync_channel(jobs.len());
@@ -96,7 +95,7 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
         let mut results = 0;
         let mut count = |(name, result): (String, Result<(), Failure>)| {
             results += 1;
-            progress.step(results, jobs.len(), "people");
+            progress(results, jobs.len());
             result.or_else(|failure| batch.failed(&name, failure))
         };
         for (job, read) in jobs.iter().zip(photographs) {
@@ -111,7 +110,7 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
     batch.end(jobs.len())
 }
 
-/// Refuses a folder whose people were made with other settings, and names the first that differs.
+/// Refuses a folder whose people were made with other settings.
 fn check_settings(path: &Path, settings: &Settings) -> Result<(), Failure> {
     if !path.exists() {
         return Ok(());
@@ -121,13 +120,7 @@ fn check_settings(path: &Path, settings: &Settings) -> Result<(), Failure> {
     // Parsed from text like the file's table: a table made directly would have other digits.
     let wanted: toml::Table =
         toml::from_str(&toml::to_string_pretty(settings).expect("TOML types")).expect("TOML");
-    match differences(&keys(&there), &keys(&wanted)).first() {
-        None => Ok(()),
-        Some((_, message)) => {
-            let why = "the people in this folder were made with other settings: give another folder";
-            Err(Failure::file(path, format_args!("{message}; {why}")))
-        }
-    }
+    output::check_settings(path, &there, &wanted)
 }
 
 /// Reads all photographs, one person after another, until the receiver is gone.

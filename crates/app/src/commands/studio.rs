@@ -162,7 +162,7 @@ impl Studio {
         };
         job.step("photographs");
         let config = networks.config();
-        let told = self.camera.updated(request.told.as_deref().unwrap_or("{}"));
+        let told = self.camera.updated(request.header("x-told").unwrap_or("{}"));
         // A page has no options, whose dashes the message begins with.
         let wrong = |e: Failure| {
             text(StatusCode::UNPROCESSABLE_ENTITY, e.to_string().trim_start_matches('-'))
@@ -233,7 +233,7 @@ fn reduced(width: u32, height: u32) -> [u32; 2] {
 /// The parts of a body, whose lengths `X-Parts` lists.
 fn parts<'a, const N: usize>(request: &Request, body: &'a [u8]) -> Result<[&'a [u8]; N], Refusal> {
     const WRONG: Refusal = (StatusCode::BAD_REQUEST, "X-Parts does not fit the body");
-    let lengths: Vec<&str> = request.parts.as_deref().unwrap_or_default().split(',').collect();
+    let lengths: Vec<&str> = request.header("x-parts").unwrap_or_default().split(',').collect();
     let lengths: [&str; N] = lengths.try_into().map_err(|_| WRONG)?;
     let mut rest = body;
     let mut found = [&body[..0]; N];

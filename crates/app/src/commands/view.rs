@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, LazyLock, Mutex, PoisonError, Weak};
+use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 use std::time::SystemTime;
 
 use clap::Args;
@@ -13,8 +13,8 @@ use snapsnap_base::FileError;
 use super::convert::{drawable, read};
 use crate::downloads::{self, Download};
 use crate::failure::Failure;
-use crate::page::{self, PageArguments, busy, text};
-use crate::server::{Answer, Bytes, Content, Request};
+use crate::page::{self, PageArguments, text};
+use crate::server::{Answer, Content, Request};
 
 #[derive(Args)]
 pub struct Arguments {
@@ -24,9 +24,6 @@ pub struct Arguments {
     page: PageArguments,
 }
 
-/// Largest number of former contents that clients may still be reading.
-const MOST_FORMER: usize = 2;
-
 /// Length and time of a file, by which a replaced file is noticed.
 type Stamp = (u64, Option<SystemTime>);
 
@@ -35,9 +32,6 @@ type Made = Mutex<HashMap<&'static str, (Stamp, Content)>>;
 
 /// The contents that are made at once, and those that take long.
 static MADE: [LazyLock<Made>; 2] = [LazyLock::new(Mutex::default), LazyLock::new(Mutex::default)];
-
-/// Contents of replaced files, which slow clients may still be reading.
-static FORMER: Mutex<Vec<Weak<Bytes>>> = Mutex::new(Vec::new());
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let input = arguments.input.as_path();
@@ -77,13 +71,7 @@ fn shared(
     if let Some((_, content)) = made.get(extension).filter(|(of, _)| *of == stamp) {
         return Ok(content.clone());
     }
-    let mut former = FORMER.lock().unwrap_or_else(PoisonError::into_inner);
-    former.extend(made.remove(extension).map(|(_, content)| Arc::downgrade(&content)));
-    former.retain(|content| content.strong_count() > 0);
-    if former.len() > MOST_FORMER {
-        return Err(busy());
-    }
-    drop(former);
+    made.remove(extension);
     let content: Content = Arc::new(download.make(&drawable(input)?.0, step)?);
     made.insert(extension, (stamp, content.clone()));
     Ok(content)

@@ -63,9 +63,7 @@ pub fn init(InitArguments { config, seed, output }: &InitArguments) -> Result<()
     let resolved = config.resolve((PUBLISHED, ""))?;
     let inputs: Vec<&Path> = config.config.iter().map(PathBuf::as_path).collect();
     check_outputs(&[output], &inputs)?;
-    let progress = Progress::bytes();
-    let parameters = weights::init(&resolved, *seed, output, &|done, total| progress.advance(done, total))?;
-    drop(progress);
+    let parameters = weights::init(&resolved, *seed, output, &Progress::megabytes())?;
     say::info(&format!("{}: {parameters} random parameters from seed {seed}", output.display()));
     Ok(())
 }
@@ -78,10 +76,7 @@ pub fn import(arguments: &ImportArguments) -> Result<(), Failure> {
     check_outputs(&[output], &inputs)?;
     let float = if arguments.half { Precision::F16 } else { Precision::F32 };
     let options = ImportOptions { fill: fill.as_deref(), seed: arguments.seed, float };
-    let progress = Progress::bytes();
-    let advance = |done, total| progress.advance(done, total);
-    let report = weights::import(sources, &config, options, output, &advance)?;
-    drop(progress);
+    let report = weights::import(sources, &config, options, output, &Progress::megabytes())?;
     for note in &report.notes {
         say::info(note);
     }
@@ -107,9 +102,7 @@ fn import_config(ImportArguments { sources, fill, config, .. }: &ImportArguments
 
 pub fn export(ExportArguments { input, output }: &ExportArguments) -> Result<(), Failure> {
     check_outputs(&[output], &[input])?;
-    let progress = Progress::bytes();
-    let tensors = weights::export(input, output, &|done, total| progress.advance(done, total))?;
-    drop(progress);
+    let tensors = weights::export(input, output, &Progress::megabytes())?;
     say::info(&format!("{}: {tensors} tensors", output.display()));
     Ok(())
 }

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use snapsnap_base::FileError;
-use snapsnap_base::config::{Schema, differences, keys};
+use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_base::random::stream;
 use snapsnap_data::Shard;
@@ -20,7 +20,7 @@ use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::Mesh;
 
 use crate::failure::{Failure, bail};
-use crate::output::{check_folder, check_outputs, is_same_file, outside_data};
+use crate::output::{check_folder, check_outputs, check_settings, is_same_file, outside_data};
 use crate::progress::Progress;
 use crate::{output, say};
 
@@ -77,9 +77,7 @@ struct CheckArguments {
 }
 
 fn check(arguments: &CheckArguments) -> Result<(), Failure> {
-    let progress = Progress::steps(0, "subjects");
-    let checked = dataset::check(&arguments.dataset, |done, all| progress.step(done, all, "subjects"))?;
-    drop(progress);
+    let checked = dataset::check(&arguments.dataset, Progress::counted("subjects"))?;
     for problem in &checked.problems {
         say::out(problem);
     }
@@ -189,15 +187,7 @@ fn make(
     let (path, resolved) = (common.output.join(CONFIG), config.to_toml());
     // People that are there already have the cameras of this config; `dataset.toml` does not have all of them.
     if let (true, Ok(there)) = (is_begun, DataConfig::from_file(&path, &[])) {
-        let differing = differences(&keys(&there), &keys(config));
-        if !differing.is_empty() {
-            let differing: Vec<String> = differing.into_iter().map(|(_, message)| message).collect();
-            let message = format!(
-                "is of people made with other settings: {}; give another folder",
-                differing.join(", ")
-            );
-            return Err(Failure::file(&path, message));
-        }
+        check_settings(&path, &there, config)?;
     }
     let given = common.config.as_deref().is_some_and(|given| is_same_file(given, &path));
     if !given && fs::read(&path).ok().as_deref() != Some(resolved.as_bytes()) {

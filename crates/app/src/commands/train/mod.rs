@@ -12,7 +12,7 @@ use burn::tensor::Device;
 use clap::Args;
 use snapsnap_base::config::Schema;
 use snapsnap_base::file;
-use snapsnap_data::dataset::{Folder, Layout};
+use snapsnap_data::dataset::Folder;
 use snapsnap_net::weights::schema::{self, DETAILS, Part};
 use snapsnap_net::weights::{WeightFile, random_predictor, random_regressors};
 use snapsnap_train::config::TrainConfig;
@@ -26,6 +26,7 @@ use snapsnap_train::task::Task;
 use super::evaluate::check_data;
 use crate::batch::unpanicked;
 use crate::failure::{Failure, bail};
+use crate::report::quoted;
 use crate::{device, interrupt, memory, say};
 
 use folder::RunFolder;
@@ -312,73 +313,19 @@ impl<'a> Plan<'a> {
             say::info(&format!("resume:  snapsnap train-stage{stage} --resume -o {run}"));
         }
         let weights = quoted(&folder.join(weights));
-        let config = self.arguments.config.as_deref().and_then(stage2_config);
-        let next = match (stage, config) {
-            (1, _) if self.config.stage1.only_details => {
+        let next = match stage {
+            1 if self.config.stage1.only_details => {
                 format!(
                     "import-weights --fill {weights} puts `details.*` beside other layers (docs/training.md)"
                 )
             }
-            (1, None) => {
-                format!("a training of stage 2, which begins with --weights {weights} (docs/training.md)")
-            }
-            (1, Some(config)) => {
-                let config = quoted(&config);
-                let data: Vec<String> = self.folders.iter().map(|folder| quoted(folder.root())).collect();
-                let data = data.join(" ");
-                let out = quoted(&folder.with_file_name(format!("{}-stage2", name(folder))));
-                format!("snapsnap train-stage2 --config {config} --data {data} --weights {weights} -o {out}")
-            }
-            _ => {
-                let pictures = self.folders.iter().find_map(|folder| example(folder));
-                let pictures = pictures.map_or("FRONT BACK".into(), |two| two.map(|p| quoted(&p)).join(" "));
-                format!(
-                    "snapsnap reconstruct {pictures} --weights {weights} -o human.ply --turntable turn.png"
-                )
-            }
+            1 => format!("a training of stage 2, which begins with --weights {weights} (docs/training.md)"),
+            _ => format!(
+                "snapsnap reconstruct FRONT BACK --weights {weights} -o human.ply --turntable turn.png"
+            ),
         };
         say::info(&format!("next:    {next}"));
     }
-}
-
-fn name(folder: &Path) -> String {
-    folder.file_name().unwrap_or_default().to_string_lossy().into_owned()
-}
-
-/// A path as a shell takes it.
-fn quoted(path: &Path) -> String {
-    let text = path.display().to_string();
-    let is_plain = |c: char| c.is_alphanumeric() || "/._-+:=@%,".contains(c);
-    if !text.is_empty() && text.chars().all(is_plain) {
-        text
-    } else {
-        format!("'{}'", text.replace('\'', r"'\''"))
-    }
-}
-
-/// The config of stage 2 beside one of stage 1, if there is one.
-fn stage2_config(stage1: &Path) -> Option<PathBuf> {
-    let name = stage1.file_name()?.to_str()?.replace("stage1", "stage2");
-    let path = stage1.with_file_name(name);
-    (path != stage1 && path.is_file()).then_some(path)
-}
-
-/// Front and back of somebody in a data set whose pictures are cut out, preferably a held-out person.
-fn example(folder: &Folder) -> Option<[PathBuf; 2]> {
-    let description = folder.description();
-    if description.layout != Layout::Exact {
-        return None;
-    }
-    let split = folder
-        .splits()
-        .into_iter()
-        .rev()
-        .find(|split| folder.subjects(*split).is_ok_and(|subjects| !subjects.is_empty()))?;
-    let subject = folder.subjects(split).ok()?.into_iter().next()?;
-    let [front, back, ..] = description.arrangement.four(0, description.views);
-    let pictures = [front, back].map(|view| folder.person(split, &subject).picture_path(view));
-    // Those of a packed data set are no files.
-    pictures.iter().all(|path| path.is_file()).then_some(pictures)
 }
 
 /// Lower bound of the memory in bytes of one of several ranks of a training: weights, gradients, two moments and
