@@ -119,19 +119,6 @@ impl Attributes {
         }
     }
 
-    /// The attributes of several parts, one part after the other.
-    pub fn joined(parts: Vec<Self>) -> Self {
-        let join =
-            |of: fn(&Self) -> &Tensor<2>| Tensor::cat(parts.iter().map(|part| of(part).clone()).collect(), 0);
-        Self {
-            opacity: join(|part| &part.opacity),
-            scale: join(|part| &part.scale),
-            rotation: join(|part| &part.rotation),
-            color: join(|part| &part.color),
-            offset: join(|part| &part.offset),
-        }
-    }
-
     /// Features `[N, 14]`: opacity, scale, rotation, colour, offset, activated as in the published code.
     pub fn from_features(features: Tensor<2>) -> Self {
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
