@@ -181,8 +181,7 @@ pub(super) mod tests {
     use super::*;
     use crate::config::{Body, Config};
     use crate::network::predictor::Body as PredictorBody;
-    use crate::network::rays::nominal;
-    use crate::network::{Input, PointMap, anchors};
+    use crate::network::{Input, PointMap, anchors, nominal_camera};
     use crate::parameters::{NamedMapper, ParameterPath, map_named};
     use crate::weights::random_predictor;
 
@@ -305,7 +304,8 @@ pub(super) mod tests {
         let seen = SideInput::new(View::Right, SIDE, &window, (points.clone(), table * 0.5), rows);
         let gradients = seen.depths[0].clone().sum().backward();
         let gradient = host(points.grad(&gradients).expect("a gradient"));
-        let axis = nominal(View::Right, OPPOSITE, SIDE).1.rotation.row(2).as_vec3().to_array();
+        let side = nominal_camera(View::Right, OPPOSITE, SIDE).world_to_camera;
+        let axis = side.rotation.row(2).as_vec3().to_array();
         for (i, gradient) in gradient.chunks_exact(3).enumerate() {
             let expected = if shown.contains(&(i as i32)) { axis } else { [0.0; 3] };
             assert!((0..3).all(|c| (gradient[c] - expected[c]).abs() < 1e-5), "{i}: {gradient:?}");
@@ -354,14 +354,14 @@ pub(super) mod tests {
                 let mut covered = [0; 4];
                 for ((view, map), covered) in maps[2..].iter().zip(&mut covered) {
                     let anchors = host(anchors(*view, OPPOSITE, SIDE, &window, &Device::flex()));
-                    let (camera, to_side) = nominal(*view, OPPOSITE, SIDE);
+                    let camera = nominal_camera(*view, OPPOSITE, SIDE);
                     for (point, anchor) in of(map).chunks_exact(3).zip(anchors.chunks_exact(3)) {
                         let apart = |p: &[f32]| (0..3).map(|c| (p[c] - point[c]).powi(2)).sum::<f32>().sqrt();
                         if apart(anchor) < 1e-5 {
                             continue;
                         }
                         let nearest = known.chunks_exact(3).map(apart).fold(f32::INFINITY, f32::min);
-                        let depth = to_side.apply(Vec3::from_slice(point).as_dvec3()).z;
+                        let depth = camera.world_to_camera.apply(Vec3::from_slice(point).as_dvec3()).z;
                         let half_diagonal = 0.5_f64.sqrt() * depth / camera.focal.x;
                         assert!(
                             f64::from(nearest) < half_diagonal + 1e-4,
