@@ -75,7 +75,7 @@ impl Prediction {
         let heads = if predictor.has_side_heads() { "heads (4)" } else { "heads (2)" };
         let mut maps = record.timed(heads, |_| predictor.heads(&decoded));
         let mut fine = Vec::new();
-        match predictor.details_resolution() {
+        match config.network.details.as_ref().map(|details| details.resolution) {
             Some(size) if size <= side => {
                 let columns = details_columns(person.as_ref(), &window, side, size);
                 let width = columns.len();
