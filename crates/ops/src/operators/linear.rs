@@ -49,7 +49,7 @@ impl Layer for Linear {
     ) -> (Vec<f32>, Option<Floats>) {
         let (size, piece) = (self.rows * self.outputs, ROWS * self.outputs);
         let (mut out, mut before) = (take(size), (self.gelu && keep).then(|| Floats::new(size)));
-        let weight = self.factor(weight);
+        let weight = Right::new(self.in_bf16, [self.inputs, self.outputs], (weight, self.strides()));
         let kept = parts(before.as_deref_mut(), piece, self.rows.div_ceil(ROWS));
         let tasks = out.par_chunks_mut(piece).zip(x.par_chunks(ROWS * self.inputs));
         tasks.zip(kept).for_each(|((out, x), before)| match before {
@@ -136,11 +136,6 @@ impl Linear {
     /// (column, row) strides of the weight as `[inputs, outputs]`.
     fn strides(&self) -> [usize; 2] {
         if self.transposed { [self.inputs, 1] } else { [1, self.outputs] }
-    }
-
-    /// The weight as the right factor.
-    fn factor<'a>(&self, weight: &'a [f32]) -> Right<'a> {
-        Right::new(self.in_bf16, [self.inputs, self.outputs], (weight, self.strides()))
     }
 
     fn product(&self, x: &[f32], rhs: &Right, bias: Option<&[f32]>, out: &mut [f32]) {
