@@ -102,12 +102,19 @@ impl Geometry {
 }
 
 impl Attributes {
-    /// Attributes of features `[N, 14]`: corrections of the `geometry`, if there is one.
+    /// Attributes of features `[N, 14]`, opacity, scale, rotation, colour and offset: corrections of the `geometry`, or,
+    /// without one, activated as in the published code.
     pub fn new(features: Tensor<2>, geometry: Option<Geometry>) -> Self {
-        let Some(Geometry { spacing, colors, limits }) = geometry else {
-            return Self::from_features(features);
-        };
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
+        let Some(Geometry { spacing, colors, limits }) = geometry else {
+            return Self {
+                opacity: sigmoid(part(0, 1)),
+                scale: sharp_softplus(part(1, 3)),
+                rotation: unit(part(4, 4)),
+                color: part(8, 3).tanh(),
+                offset: part(11, 3) * 0.001,
+            };
+        };
         let upright = Tensor::from_data([[1.0, 0.0, 0.0, 0.0]], &features.device());
         Self {
             opacity: sigmoid(part(0, 1) + START_OPACITY) * (1.0 - limits.opacity) + limits.opacity,
@@ -116,18 +123,6 @@ impl Attributes {
             // Small corrections are the same for every limit.
             color: colors + (part(8, 3) / limits.color).tanh() * limits.color,
             offset: part(11, 3) * spacing,
-        }
-    }
-
-    /// Features `[N, 14]`: opacity, scale, rotation, colour, offset, activated as in the published code.
-    pub fn from_features(features: Tensor<2>) -> Self {
-        let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
-        Self {
-            opacity: sigmoid(part(0, 1)),
-            scale: sharp_softplus(part(1, 3)),
-            rotation: unit(part(4, 4)),
-            color: part(8, 3).tanh(),
-            offset: part(11, 3) * 0.001,
         }
     }
 }
