@@ -172,7 +172,7 @@ impl CanvasView<'_> {
 
     fn geometry(&self, config: &Config, side: usize, limits: Limits, device: &Device) -> Geometry {
         let camera = nominal_camera(self.view, config.network.pair_degrees, side);
-        Geometry::new(self.image, self.points, self.valid, &camera, limits, device)
+        Geometry::new(self, &camera, limits, device)
     }
 }
 

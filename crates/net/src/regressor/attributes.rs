@@ -6,6 +6,7 @@ use glam::Vec3;
 use snapsnap_splat::{Camera, RigidTransform};
 
 use crate::config::RegressorConfig;
+use crate::painter::CanvasView;
 
 /// Gaussian attributes of N pixels.
 #[derive(Debug, Clone)]
@@ -62,16 +63,9 @@ const LOG_SCALE: f64 = 2.0;
 const MOST_SPACING: f32 = 3.0;
 
 impl Geometry {
-    /// The geometry of a view's valid pixels, row by row, from colours `[3, S, S]` and points `[S, S, 3]`. The world
-    /// of `camera` is the frame of the points.
-    pub fn new(
-        image: &[f32],
-        points: &[f32],
-        valid: &[bool],
-        camera: &Camera,
-        limits: Limits,
-        device: &Device,
-    ) -> Self {
+    /// The geometry of a view's valid pixels, row by row. The world of `camera` is the frame of the points.
+    pub fn new(view: &CanvasView, camera: &Camera, limits: Limits, device: &Device) -> Self {
+        let CanvasView { image, points, valid, .. } = *view;
         let side = camera.width as usize;
         let RigidTransform { rotation, translation } = camera.world_to_camera;
         let depth = |point: Vec3| (rotation.row(2).dot(point.as_dvec3()) + translation.z) as f32;
