@@ -15,7 +15,7 @@ use burn::tensor::{FloatDType, Tensor};
 
 use crate::device::{has_kernels, in_f32, is_bf16, is_tracked_on_gpu};
 use crate::gpu_convolution::convolve;
-use crate::op::{self, InputGradients, Kept, Kernel};
+use crate::op::{self, Given, InputGradients, Kept, Kernel};
 use crate::operators::{Conv1x1, Conv3x3, Layer, LayerNorm, Linear, Unfolded};
 
 /// A linear layer: `[B, N, inputs]` → `[B, N, outputs]`.
@@ -172,13 +172,8 @@ impl<L: Layer> Kernel for Operator<L> {
         (out, keep.then(|| Box::new(kept) as _))
     }
 
-    fn backward(
-        &self,
-        [x, weight, _]: [&[f32]; 3],
-        kept: Kept,
-        upstream: &[f32],
-        [of_input, of_weight, of_bias]: [bool; 3],
-    ) -> InputGradients {
+    fn backward(&self, Given { inputs: [x, weight, _], kept, upstream, wanted }: Given) -> InputGradients {
+        let [of_input, of_weight, of_bias] = wanted;
         let kept = kept.and_then(|kept| kept.downcast::<L::Kept>().ok()).expect("kept by the forward pass");
         self.layer.backward(x, weight, *kept, upstream, [of_input, of_weight, of_bias && self.has_bias])
     }

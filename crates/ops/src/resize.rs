@@ -9,7 +9,7 @@ use snapsnap_base::bilinear::{Tap, taps};
 
 use crate::buffers::take;
 use crate::device::has_kernels;
-use crate::op::{self, InputGradients, Kept, Kernel};
+use crate::op::{self, Given, InputGradients, Kept, Kernel};
 use crate::vectors::vectorized;
 
 /// Bilinear resize of `[B, C, H, W]` to `size` (rows, columns).
@@ -84,7 +84,7 @@ impl Kernel for Resize {
         (out, None)
     }
 
-    fn backward(&self, _: [&[f32]; 3], _: Kept, upstream: &[f32], _: [bool; 3]) -> InputGradients {
+    fn backward(&self, Given { upstream, .. }: Given) -> InputGradients {
         let [batch, channels, rows, columns] = self.from;
         let (width, size) = (self.across.len(), self.down.len() * self.across.len());
         let mut out = take(batch * channels * rows * columns);

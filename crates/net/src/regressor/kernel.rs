@@ -6,7 +6,7 @@ use burn::module::Param;
 use burn::nn::conv::Conv2d;
 use burn::tensor::Tensor;
 use snapsnap_ops::fused::Needed;
-use snapsnap_ops::op::{self, InputGradients, Kept, Kernel};
+use snapsnap_ops::op::{self, Given, InputGradients, Kept, Kernel};
 use snapsnap_ops::regressor::{FEATURES, Network, Saved};
 
 use super::unet::UNet;
@@ -30,15 +30,10 @@ impl Kernel for Pass {
         (features, saved.map(|saved| Box::new(saved) as _))
     }
 
-    fn backward(
-        &self,
-        [input, parameters, _]: [&[f32]; 3],
-        kept: Kept,
-        upstream: &[f32],
-        [wants_input, wants_parameters, _]: [bool; 3],
-    ) -> InputGradients {
+    fn backward(&self, given: Given) -> InputGradients {
+        let Given { inputs: [input, parameters, _], kept, upstream, wanted } = given;
         let saved = kept.and_then(|kept| kept.downcast::<Saved>().ok()).expect("kept by the forward pass");
-        let wanted = Needed { input: wants_input, parameters: wants_parameters };
+        let wanted = Needed { input: wanted[0], parameters: wanted[1] };
         let [input, parameters] = self.network.backward(parameters, input, *saved, upstream, wanted);
         [input, parameters, None]
     }
