@@ -73,15 +73,8 @@ impl Layer for Linear {
         (out, before)
     }
 
-    /// Gradients from the output's gradient `dy` `[rows, outputs]`.
-    fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        before: Option<Floats>,
-        dy: &[f32],
-        [of_input, of_weight, of_bias]: [bool; 3],
-    ) -> InputGradients {
+    fn backward(&self, given: [&[f32]; 3], before: Option<Floats>, wanted: [bool; 3]) -> InputGradients {
+        let ([x, weight, dy], [of_input, of_weight, of_bias]) = (given, wanted);
         assert_eq!(before.is_some(), self.gelu, "kept by the forward pass");
         let Self { rows, inputs, outputs, .. } = *self;
         let blocks = rows.div_ceil(ROWS);
