@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use snapsnap_ops::has_kernels;
 
-use crate::config::{CELL, Config, NetworkConfig, PATCH};
+use crate::config::{CELL, Config, NetworkConfig, PATCH, Sides};
 use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::photograph::Photograph;
 use crate::steps::{Record, Step};
@@ -72,7 +72,8 @@ impl Prediction {
         let input_images = input.images.clone();
         let encoded = record.timed("encoder", |_| predictor.encode(input));
         let decoded = record.timed("decoders", |_| predictor.decode(encoded));
-        let heads = if predictor.has_side_heads() { "heads (4)" } else { "heads (2)" };
+        let has_side_heads = predictor.views().len() > 2 && config.network.sides == Sides::Predicted;
+        let heads = if has_side_heads { "heads (4)" } else { "heads (2)" };
         let mut maps = record.timed(heads, |_| predictor.heads(&decoded));
         let mut fine = Vec::new();
         match config.network.details.as_ref().map(|details| details.resolution) {

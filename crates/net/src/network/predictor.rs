@@ -12,7 +12,7 @@ use super::input::Input;
 use super::rays::{anchors, on_rays};
 use super::unet::Levels;
 use super::view::View;
-use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Sides, Upsample};
+use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Upsample};
 use crate::resample::shrink;
 use crate::window::Window;
 use snapsnap_ops::bilinear;
@@ -205,11 +205,6 @@ impl PointPredictor {
         }
     }
 
-    /// Whether the unseen sides have heads of their own.
-    pub fn has_side_heads(&self) -> bool {
-        self.views().len() > 2 && self.config.sides == Sides::Predicted
-    }
-
     /// Whether the layer of this name in a checkpoint outputs raw points.
     pub(crate) fn is_last_layer(name: &str) -> bool {
         Dust3r::is_last_layer(name) || name.ends_with("decoder.conv_out")
@@ -282,7 +277,7 @@ impl PointPredictor {
                 Decoded::Tokens(net.decode(front, back, grid), grid)
             }
             (Body::Convolution(net), Encoded::Levels(levels)) => {
-                let features = net.features(&levels);
+                let features = net.body.features(&levels);
                 Decoded::Levels(levels, features)
             }
             _ => panic!("encoded by another network"),
