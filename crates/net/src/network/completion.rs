@@ -181,7 +181,7 @@ pub(super) mod tests {
     use super::*;
     use crate::config::{Body, Config};
     use crate::network::predictor::Body as PredictorBody;
-    use crate::network::{Input, PointMap, anchors, nominal_camera};
+    use crate::network::{Input, PointMap, PointPredictor, anchors, nominal_camera};
     use crate::parameters::{NamedMapper, ParameterPath, map_named};
     use crate::weights::random_predictor;
 
@@ -312,24 +312,32 @@ pub(super) mod tests {
         }
     }
 
-    /// Points of all views from random photographs, by a predictor whose completion network corrects nothing.
-    fn uncorrected(both_ways: bool, b: usize) -> Vec<(View, Vec<f32>)> {
-        struct Nothing;
-        impl NamedMapper for Nothing {
+    /// The predictor, in which the output of the `layer` is this value everywhere.
+    pub fn with_output(predictor: PointPredictor, layer: &str, value: f64) -> PointPredictor {
+        struct Constant<'a>(&'a str, f64);
+        impl NamedMapper for Constant<'_> {
             fn map<const D: usize>(
                 &mut self,
                 path: &ParameterPath,
                 param: Param<Tensor<D>>,
             ) -> Param<Tensor<D>> {
-                match path.name().contains("completion.decoder.conv_out") {
-                    true => param.map(|values| values.zeros_like()),
-                    false => param,
+                let name = path.name();
+                if !name.contains(self.0) {
+                    return param;
                 }
+                let value = if name.ends_with("bias") { self.1 } else { 0.0 };
+                param.map(|values| values.zeros_like() + value)
             }
         }
+        map_named(predictor, "", &mut Constant(layer, value))
+    }
+
+    /// Points of all views from random photographs, by a predictor whose completion network corrects nothing.
+    fn uncorrected(both_ways: bool, b: usize) -> Vec<(View, Vec<f32>)> {
         let network = NetworkConfig { both_ways, delta: 0.02, ..config() };
         let config = Config { network, ..Config::default() };
-        let net = map_named(random_predictor(&config, 3, &Device::flex()), "", &mut Nothing);
+        let net = random_predictor(&config, 3, &Device::flex());
+        let net = with_output(net, "completion.decoder.conv_out", 0.0);
         let window = Window { rows: 0..SIDE, columns: 0..SIDE };
         let masks = (noise([2 * b, 1, SIDE, SIDE], 4) + 0.9).clamp(0.0, 1.0);
         let colors = noise([2 * b, 3, SIDE, SIDE], 3) * masks.clone();

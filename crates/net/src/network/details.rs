@@ -243,15 +243,13 @@ impl SecondLook {
 
 #[cfg(test)]
 mod tests {
-    use burn::module::Param;
     use burn::tensor::TensorData;
     use snapsnap_ops::host;
 
     use super::*;
     use crate::Prediction;
     use crate::config::{Config, NetworkConfig};
-    use crate::network::completion::tests::{SIDE, config as small};
-    use crate::parameters::{NamedMapper, ParameterPath, map_named};
+    use crate::network::completion::tests::{SIDE, config as small, with_output};
     use crate::steps::Record;
     use crate::weights::random_predictor;
 
@@ -269,23 +267,8 @@ mod tests {
 
     /// The predictor, whose network of details moves every point by `relief` network units.
     fn moving(config: &Config, relief: f32) -> PointPredictor {
-        struct Constant(f32);
-        impl NamedMapper for Constant {
-            fn map<const D: usize>(
-                &mut self,
-                path: &ParameterPath,
-                param: Param<Tensor<D>>,
-            ) -> Param<Tensor<D>> {
-                match path.name().as_str() {
-                    "details.decoder.conv_out.weight" => param.map(|values| values.zeros_like()),
-                    "details.decoder.conv_out.bias" => {
-                        param.map(|values| values.zeros_like() + f64::from(self.0) / UNIT)
-                    }
-                    _ => param,
-                }
-            }
-        }
-        map_named(random_predictor(config, 3, &Device::flex()), "", &mut Constant(relief))
+        let predictor = random_predictor(config, 3, &Device::flex());
+        with_output(predictor, "details.decoder.conv_out", f64::from(relief) / UNIT)
     }
 
     /// Points of all views of a person in the middle of both photographs.
