@@ -94,7 +94,9 @@ impl Prediction {
         }
         maps.splice(..fine.len(), fine);
         let finished = |(view, map): (View, PointMap)| {
-            (view, predictor.finished(config, view, map, &window, mask_of(view, masks).as_ref()))
+            // The sides have no mask.
+            let mask = ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1));
+            (view, predictor.finished(config, view, map, &window, mask.as_ref()))
         };
         let maps = record.timed("up-sampling", |_| each_view(maps, finished));
         Self { maps, window }
@@ -131,11 +133,6 @@ fn each_view<T: Send>(
         true => maps.into_par_iter().map(change).collect(),
         false => maps.into_iter().map(change).collect(),
     }
-}
-
-/// The mask `[B,1,S,S]` of a photograph; `None` for the sides.
-fn mask_of(view: View, masks: &Tensor<4>) -> Option<Tensor<4>> {
-    ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1))
 }
 
 #[cfg(test)]

@@ -156,9 +156,11 @@ impl PointPredictor {
         let patch_rays = rays(fine / PATCH);
         // Of each photograph's points, and of the means nearby.
         let distances = [0, 1].map(|view| {
-            let nearby = mean_nearby(&maps[view].1, &mask(view, coarse));
+            let map = &maps[view].1;
+            let nearby = means(map.points.clone().permute([0, 3, 1, 2]), &mask(view, coarse));
+            let nearby = PointMap { points: nearby.permute([0, 2, 3, 1]), conf: map.conf.clone() };
             let outside = shares[view].clone().lower_equal_elem(0.0);
-            [maps[view].1.clone(), nearby].map(|map| {
+            [map.clone(), nearby].map(|map| {
                 let points = larger(map, view, fine / PATCH).points;
                 let distance = (points * patch_rays[view].forward.clone()).sum_dim(3);
                 (distance.permute([0, 3, 1, 2]) * shares[view].clone()).mask_fill(outside.clone(), 0.0)
@@ -192,12 +194,6 @@ impl PointPredictor {
     pub fn relief(&self, images: Tensor<4>) -> Tensor<4> {
         self.details.as_ref().expect("a network of details").relief(images)
     }
-}
-
-/// Points with the mean of the person's points nearby, by its share of each pixel `[B, 1, h, w]`.
-fn mean_nearby(map: &PointMap, mask: &Tensor<4>) -> PointMap {
-    let points = means(map.points.clone().permute([0, 3, 1, 2]), mask);
-    PointMap { points: points.permute([0, 2, 3, 1]), conf: map.conf.clone() }
 }
 
 /// Means of the person's values nearby `[B, C, h, w]`, by its share of each pixel `[B, 1, h, w]`.
