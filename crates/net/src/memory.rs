@@ -18,20 +18,13 @@ impl Config {
     /// Bytes that [`crate::Reconstructor::reconstruct`] needs for a standing person and so many `parameters`.
     pub fn memory_needed(&self, parameters: u64) -> u64 {
         let n = &self.network;
-        let area = |side: usize| (side as u64).saturating_mul(side as u64);
+        let area = |side: usize| (side * side) as u64;
         // A head's maps at half and at full resolution of the network.
-        let head = area(n.net_resolution).saturating_mul(F32 * n.feature_dim as u64);
+        let head = area(n.net_resolution) * F32 * n.feature_dim as u64;
         // Second surfaces are two more views.
         let per_pixel = if n.second_layer { PER_PIXEL * 3 / 2 } else { PER_PIXEL };
-        let canvas = area(n.resolution).saturating_mul(per_pixel);
-        let image = |details: &DetailsConfig| {
-            area(details.resolution / PATCH).saturating_mul(F32 * details.dims[0] as u64)
-        };
-        let details =
-            n.details.as_ref().map_or(0, |details| image(details).saturating_mul(2 * DETAIL_IMAGES));
-        BASE.saturating_add(parameters.saturating_mul(F32))
-            .saturating_add(head)
-            .saturating_add(canvas)
-            .saturating_add(details)
+        let image = |details: &DetailsConfig| area(details.resolution / PATCH) * F32 * details.dims[0] as u64;
+        let details = n.details.as_ref().map_or(0, |details| 2 * DETAIL_IMAGES * image(details));
+        BASE + parameters * F32 + head + area(n.resolution) * per_pixel + details
     }
 }

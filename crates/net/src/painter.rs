@@ -4,7 +4,7 @@
 use std::borrow::Cow;
 use std::ops::Range;
 
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_ops::gather::taken;
 use snapsnap_ops::host;
 use snapsnap_splat::Gaussians;
@@ -16,6 +16,7 @@ pub use crate::nearest_colors::side_images;
 use crate::network::{View, nominal_camera};
 use crate::photograph::Photograph;
 use crate::points::Points;
+use crate::reconstruct::rows;
 use crate::regressor::{Attributes, FEATURES, Geometry, Limits, Regressor};
 use crate::steps::{Record, Step};
 use crate::valid_pixels::Chosen;
@@ -171,7 +172,7 @@ impl CanvasView<'_> {
 
     fn geometry(&self, config: &Config, side: usize, limits: Limits, device: &Device) -> Geometry {
         let camera = nominal_camera(self.view, config.network.pair_degrees, side);
-        Geometry::new(self.image, self.points, self.valid, &camera, limits, device)
+        Geometry::new(self, &camera, limits, device)
     }
 }
 
@@ -269,39 +270,32 @@ fn assemble(parts: Vec<Part>, device: &Device) -> (Gaussians, Vec<Origin>) {
     if parts.is_empty() {
         return (none(device), Vec::new());
     }
-    let (mut features, mut points, mut attributes, mut origins) =
-        (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut features, mut gaussians, mut origins) = (Vec::new(), Vec::new(), Vec::new());
     for part in parts {
-        attributes.push(Attributes::new(part.features.clone(), part.geometry));
+        let Attributes { opacity, scale, rotation, color, offset } =
+            Attributes::new(part.features.clone(), part.geometry);
+        let (opacities, colors) = (opacity.squeeze_dim(1), color * 0.5 + 0.5);
+        let made = Gaussians::new(part.points + offset, rotation, scale, opacities, colors);
+        gaussians.push(made.expect("consistent by construction"));
         features.push(part.features);
-        points.push(part.points);
         origins.extend(part.origins);
     }
-    let (features, attributes) = (Tensor::cat(features, 0), Attributes::joined(attributes));
-    let means = Tensor::cat(points, 0) + attributes.offset;
+    let gaussians = Gaussians::joined(&gaussians);
+    let (features, means) =
+        (Tensor::cat(features, 0).without_autodiff(), gaussians.means.clone().without_autodiff());
     // 0 for sound rows. The product of 0 with NaN or infinity is NaN.
-    let unsound = (features.without_autodiff() * 0.0).sum_dim(1)
-        + means.clone().without_autodiff().abs().greater_elem(FARTHEST).float().sum_dim(1)
-        + (means.clone().without_autodiff() * 0.0).sum_dim(1);
+    let unsound = (features * 0.0).sum_dim(1)
+        + means.clone().abs().greater_elem(FARTHEST).float().sum_dim(1)
+        + (means * 0.0).sum_dim(1);
     let unsound = host(unsound);
-    let keep: Vec<i64> = (0..unsound.len()).filter(|i| unsound[*i] == 0.0).map(|i| i as i64).collect();
-    let (n, kept) = (unsound.len(), keep.len());
-    if kept == 0 {
-        return (none(device), Vec::new());
+    let keep: Vec<i32> = (0..unsound.len()).filter(|i| unsound[*i] == 0.0).map(|i| i as i32).collect();
+    match keep.len() {
+        0 => (none(device), Vec::new()),
+        kept if kept < origins.len() => {
+            (rows(&gaussians, &keep), keep.iter().map(|row| origins[*row as usize]).collect())
+        }
+        _ => (gaussians, origins),
     }
-    if kept < n {
-        origins = keep.iter().map(|row| origins[*row as usize]).collect();
-    }
-    let index = Tensor::<1, Int>::from_data(TensorData::new(keep, [kept]), &means.device());
-    let pick = |x: Tensor<2>| if kept < n { x.select(0, index.clone()) } else { x };
-    let gaussians = Gaussians::new(
-        pick(means),
-        pick(attributes.rotation),
-        pick(attributes.scale),
-        pick(attributes.opacity).squeeze_dim(1),
-        pick(attributes.color) * 0.5 + 0.5,
-    );
-    (gaussians.expect("consistent by construction"), origins)
 }
 
 fn count(mask: &[bool]) -> usize {

@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use snapsnap_ops::has_kernels;
 
-use crate::config::{CELL, Config, NetworkConfig, PATCH};
+use crate::config::{CELL, Config, NetworkConfig, PATCH, Sides};
 use crate::network::{Input, PointMap, PointPredictor, View};
 use crate::photograph::Photograph;
 use crate::steps::{Record, Step};
@@ -72,10 +72,11 @@ impl Prediction {
         let input_images = input.images.clone();
         let encoded = record.timed("encoder", |_| predictor.encode(input));
         let decoded = record.timed("decoders", |_| predictor.decode(encoded));
-        let heads = if predictor.has_side_heads() { "heads (4)" } else { "heads (2)" };
+        let has_side_heads = predictor.views().len() > 2 && config.network.sides == Sides::Predicted;
+        let heads = if has_side_heads { "heads (4)" } else { "heads (2)" };
         let mut maps = record.timed(heads, |_| predictor.heads(&decoded));
         let mut fine = Vec::new();
-        match predictor.details_resolution() {
+        match config.network.details.as_ref().map(|details| details.resolution) {
             Some(size) if size <= side => {
                 let columns = details_columns(person.as_ref(), &window, side, size);
                 let width = columns.len();
@@ -93,7 +94,9 @@ impl Prediction {
         }
         maps.splice(..fine.len(), fine);
         let finished = |(view, map): (View, PointMap)| {
-            (view, predictor.finished(config, view, map, &window, mask_of(view, masks).as_ref()))
+            // The sides have no mask.
+            let mask = ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1));
+            (view, predictor.finished(config, view, map, &window, mask.as_ref()))
         };
         let maps = record.timed("up-sampling", |_| each_view(maps, finished));
         Self { maps, window }
@@ -130,11 +133,6 @@ fn each_view<T: Send>(
         true => maps.into_par_iter().map(change).collect(),
         false => maps.into_iter().map(change).collect(),
     }
-}
-
-/// The mask `[B,1,S,S]` of a photograph; `None` for the sides.
-fn mask_of(view: View, masks: &Tensor<4>) -> Option<Tensor<4>> {
-    ((view as usize) < 2).then(|| masks.clone().narrow(1, view as usize, 1))
 }
 
 #[cfg(test)]

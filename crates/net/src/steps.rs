@@ -136,24 +136,19 @@ pub struct Record<'a> {
     pub steps: Vec<Step>,
     /// Time per module, with the device synchronised before and after each. Empty for a silent record.
     pub times: Vec<(&'static str, Duration)>,
-    watch: Option<Watch<'a>>,
-}
-
-#[derive(Clone, Copy)]
-struct Watch<'a> {
-    device: &'a Device,
-    stage: &'a dyn Fn(&'static str),
+    /// The device to measure, and what is called before each module.
+    watch: Option<(&'a Device, &'a dyn Fn(&'static str))>,
 }
 
 impl<'a> Record<'a> {
     /// Measures times on `device`. `stage` is called with the name of each module before it runs.
     pub fn new(device: &'a Device, stage: &'a dyn Fn(&'static str)) -> Self {
-        Self { watch: Some(Watch { device, stage }), ..Self::default() }
+        Self { watch: Some((device, stage)), ..Self::default() }
     }
 
     /// Does the work of a module.
     pub(crate) fn timed<T>(&mut self, name: &'static str, work: impl FnOnce(&mut Self) -> T) -> T {
-        let Some(Watch { device, stage }) = self.watch else { return work(self) };
+        let Some((device, stage)) = self.watch else { return work(self) };
         stage(name);
         device.sync().expect("the device finishes its work");
         let start = Instant::now();

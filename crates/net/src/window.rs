@@ -59,16 +59,11 @@ impl Window {
             window.rows.end = (window.rows.end + cell).min(side);
         }
         if config.network.mirror || config.network.both_ways || config.network.details.is_some() {
-            window.symmetric(side)
-        } else {
-            window
+            // Grown until a horizontal flip of the canvas leaves it in place.
+            let start = window.columns.start.min(side - window.columns.end);
+            window.columns = start..side - start;
         }
-    }
-
-    /// Grown until a horizontal flip of the canvas leaves it in place.
-    fn symmetric(&self, side: usize) -> Self {
-        let start = self.columns.start.min(side - self.columns.end);
-        Self { rows: self.rows.clone(), columns: start..side - start }
+        window
     }
 
     /// Grown by `margin` pixels, then to multiples of 4, inside the canvas, whose side is a multiple of 4. With the

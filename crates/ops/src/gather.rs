@@ -57,13 +57,11 @@ impl<B: Backend> Backward<B, 1> for RowsBackward {
 
 impl<B: RowsBackend, C: CheckpointStrategy> RowsBackend for Autodiff<B, C> {
     fn take(One { tensor }: One<Self>, rows: Arc<[i32]>) -> One<Self> {
-        let shape = tensor.shape();
-        let tensor = match RowsBackward.prepare::<C>([tensor.node()]).compute_bound().stateful() {
-            OpsKind::Tracked(prepared) => {
-                let taken = select::<B>(tensor.into_primitive(), &rows);
-                prepared.finish((rows, shape), taken)
-            }
-            OpsKind::UnTracked(prepared) => prepared.finish(select::<B>(tensor.into_primitive(), &rows)),
+        let (shape, node) = (tensor.shape(), tensor.node());
+        let taken = select::<B>(tensor.into_primitive(), &rows);
+        let tensor = match RowsBackward.prepare::<C>([node]).compute_bound().stateful() {
+            OpsKind::Tracked(prepared) => prepared.finish((rows, shape), taken),
+            OpsKind::UnTracked(prepared) => prepared.finish(taken),
         };
         One { tensor }
     }

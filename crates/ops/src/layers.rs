@@ -15,8 +15,8 @@ use burn::tensor::{FloatDType, Tensor};
 
 use crate::device::{has_kernels, in_f32, is_bf16, is_tracked_on_gpu};
 use crate::gpu_convolution::convolve;
-use crate::op::{self, InputGradients, Kept, Kernel};
-use crate::operators::{Conv1x1, Conv3x3, Layer, LayerNorm, Linear, Unfolded};
+use crate::op::{self, Given, InputGradients, Kept, Kernel};
+use crate::operators::{Convolution, Layer, LayerNorm, Linear};
 
 /// A linear layer: `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
@@ -93,25 +93,15 @@ pub fn conv2d(layer: &Conv2d, x: Tensor<4>, rectified: bool) -> Tensor<4> {
         }
         .cast(dtype);
     }
-    let plain = is_plain && has_kernels(&x);
-    match (plain, [rows, columns], layer.stride) {
-        (true, [3, 3], [1, 1]) => {
-            let sizes = Conv3x3 { batch, inputs, outputs, height, width, rectified };
-            run(sizes, [batch, outputs, height, width], x, weight, bias)
-        }
-        (true, [3, 3], [2, 2]) => {
-            let sizes = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified };
-            run(sizes, [batch, outputs, height.div_ceil(2), width.div_ceil(2)], x, weight, bias)
-        }
-        (true, [1, 1], [1, 1]) => {
-            let sizes = Conv1x1 { batch, inputs, outputs, pixels: height * width, rectified, in_bf16 };
-            run(sizes, [batch, outputs, height, width], x, weight, bias)
-        }
-        _ => {
-            let dtype = x.dtype();
-            layer.forward(if rectified { relu(x) } else { x }.cast(layer.weight.val().dtype())).cast(dtype)
-        }
+    let is_known = matches!(([rows, columns], layer.stride), ([3, 3], [1, 1] | [2, 2]) | ([1, 1], [1, 1]));
+    if is_plain && is_known && has_kernels(&x) {
+        let (side, stride) = (rows, down);
+        let shape = [batch, outputs, height.div_ceil(stride), width.div_ceil(stride)];
+        let sizes = Convolution { batch, inputs, outputs, height, width, side, stride, rectified, in_bf16 };
+        return run(sizes, shape, x, weight, bias);
     }
+    let dtype = x.dtype();
+    layer.forward(if rectified { relu(x) } else { x }.cast(weight.dtype())).cast(dtype)
 }
 
 /// A transposed convolution whose kernel is as large as its stride: `[B, C, H, W]` → `[B, D, stride·H, stride·W]`. The
@@ -127,8 +117,9 @@ pub fn enlarge(layer: &ConvTranspose2d, x: Tensor<4>) -> Tensor<4> {
     let weight: Tensor<2> = layer.weight.val().reshape([inputs, squares]).transpose();
     let bias =
         layer.bias.as_ref().map(|bias| bias.val().reshape([outputs, 1]).repeat_dim(1, s * s).flatten(0, 1));
-    let (pixels, in_bf16) = (height * width, is_bf16(&layer.weight));
-    let sizes = Conv1x1 { batch, inputs, outputs: squares, pixels, rectified: false, in_bf16 };
+    let (side, stride, rectified, in_bf16) = (1, 1, false, is_bf16(&layer.weight));
+    let sizes =
+        Convolution { batch, inputs, outputs: squares, height, width, side, stride, rectified, in_bf16 };
     let enlarged = run(sizes, [batch, outputs, s, s, height, width], x, weight, bias);
     enlarged.permute([0, 1, 4, 2, 5, 3]).reshape([batch, outputs, s * height, s * width])
 }
@@ -172,15 +163,10 @@ impl<L: Layer> Kernel for Operator<L> {
         (out, keep.then(|| Box::new(kept) as _))
     }
 
-    fn backward(
-        &self,
-        [x, weight, _]: [&[f32]; 3],
-        kept: Kept,
-        upstream: &[f32],
-        [of_input, of_weight, of_bias]: [bool; 3],
-    ) -> InputGradients {
+    fn backward(&self, Given { inputs: [x, weight, _], kept, upstream, wanted }: Given) -> InputGradients {
+        let [of_input, of_weight, of_bias] = wanted;
         let kept = kept.and_then(|kept| kept.downcast::<L::Kept>().ok()).expect("kept by the forward pass");
-        self.layer.backward(x, weight, *kept, upstream, [of_input, of_weight, of_bias && self.has_bias])
+        self.layer.backward([x, weight, upstream], *kept, [of_input, of_weight, of_bias && self.has_bias])
     }
 }
 

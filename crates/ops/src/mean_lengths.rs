@@ -5,7 +5,7 @@ use burn::tensor::Tensor;
 use rayon::prelude::*;
 
 use crate::device::has_kernels;
-use crate::op::{self, InputGradients, Kept, Kernel};
+use crate::op::{self, Given, InputGradients, Kept, Kernel};
 
 /// Vectors whose squared length is smaller have no gradient: their direction is noise.
 const MIN_SQUARE: f64 = 1e-24;
@@ -122,14 +122,9 @@ impl Kernel for MeanLengths {
         (means, keep.then(|| Box::new(pairs) as _))
     }
 
-    fn backward(
-        &self,
-        [vectors, weight, _]: [&[f32]; 3],
-        kept: Kept,
-        upstream: &[f32],
-        [wanted, ..]: [bool; 3],
-    ) -> InputGradients {
-        if !wanted {
+    fn backward(&self, given: Given) -> InputGradients {
+        let Given { inputs: [vectors, weight, _], kept, upstream, wanted } = given;
+        if !wanted[0] {
             return [None, None, None];
         }
         let (area, count) = (self.area(), self.offsets.len());

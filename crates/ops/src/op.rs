@@ -25,13 +25,19 @@ pub trait Kernel: Debug + Send + Sync + 'static {
     fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept);
 
     /// The gradients of the wanted inputs, each as long as its input, from the gradient of the result.
-    fn backward(
-        &self,
-        inputs: [&[f32]; 3],
-        kept: Kept,
-        upstream: &[f32],
-        wanted: [bool; 3],
-    ) -> InputGradients;
+    fn backward(&self, given: Given) -> InputGradients;
+}
+
+/// What a backward pass receives.
+pub struct Given<'a> {
+    /// The inputs of the forward pass.
+    pub inputs: [&'a [f32]; 3],
+    /// What the forward pass kept.
+    pub kept: Kept,
+    /// The gradient of the result.
+    pub upstream: &'a [f32],
+    /// The inputs whose gradients are wanted.
+    pub wanted: [bool; 3],
 }
 
 /// The gradients of the inputs; `None` for unwanted ones.
@@ -101,7 +107,8 @@ impl Backward<Flex, 3> for KernelBackward {
         let Call { inputs, kernel, kept } = ops.state;
         let (fields, wanted) = (contiguous(&inputs), ops.parents.each_ref().map(Option::is_some));
         let kept = kept.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let gradients = kernel.backward(fields.each_ref().map(slice), kept, slice(&upstream), wanted);
+        let inputs = fields.each_ref().map(slice);
+        let gradients = kernel.backward(Given { inputs, kept, upstream: slice(&upstream), wanted });
         for ((parent, gradient), field) in ops.parents.into_iter().zip(gradients).zip(fields) {
             if let Some((parent, gradient)) = parent.zip(gradient) {
                 let gradient = FlexTensor::from_data(TensorData::new(gradient, field.shape()));

@@ -9,7 +9,7 @@ use snapsnap_base::bilinear::{Tap, taps};
 
 use crate::buffers::take;
 use crate::device::has_kernels;
-use crate::op::{self, InputGradients, Kept, Kernel};
+use crate::op::{self, Given, InputGradients, Kept, Kernel};
 use crate::vectors::vectorized;
 
 /// Bilinear resize of `[B, C, H, W]` to `size` (rows, columns).
@@ -56,30 +56,23 @@ impl Kernel for Resize {
     }
 
     fn forward(&self, [x, ..]: [&[f32]; 3], _keep: bool) -> (Vec<f32>, Kept) {
-        (resize(x, [self.from[2], self.from[3]], &self.down, &self.across), None)
-    }
-
-    fn backward(&self, _: [&[f32]; 3], _: Kept, upstream: &[f32], _: [bool; 3]) -> InputGradients {
-        let size = [self.from[2], self.from[3]];
-        [Some(resize_gradient(upstream, size, &self.down, &self.across)), None, None]
-    }
-}
-
-/// Planes `[count, rows, columns]` → `[count, down.len(), across.len()]`.
-fn resize(planes: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across: &[Tap]) -> Vec<f32> {
-    let count = planes.len() / (rows * columns);
-    let mut out = vec![0.0_f32; count * down.len() * across.len()];
-    out.par_chunks_mut(down.len() * across.len()).zip(planes.par_chunks(rows * columns)).for_each(
-        |(out, plane)| {
+        let [batch, channels, rows, columns] = self.from;
+        let (width, size) = (self.across.len(), self.down.len() * self.across.len());
+        let mut out = vec![0.0_f32; batch * channels * size];
+        let planes = out.par_chunks_exact_mut(size).zip(x.par_chunks_exact(rows * columns));
+        planes.for_each(|(out, plane)| {
             // The two resized rows in use, and their row numbers.
             let mut held = [usize::MAX; 2];
-            let mut stretched = [vec![0.0; across.len()], vec![0.0; across.len()]];
-            for (out, &(low, high, weight)) in out.chunks_exact_mut(across.len()).zip(down) {
+            let mut stretched = [vec![0.0; width], vec![0.0; width]];
+            for (out, &(low, high, weight)) in out.chunks_exact_mut(width).zip(&self.down) {
                 for row in [low, high] {
                     // Neighbouring rows differ in parity, so they never share a slot.
                     if held[row % 2] != row {
                         held[row % 2] = row;
-                        stretch(&plane[row * columns..(row + 1) * columns], across, &mut stretched[row % 2]);
+                        let line = &plane[row * columns..(row + 1) * columns];
+                        for (out, &(low, high, weight)) in stretched[row % 2].iter_mut().zip(&self.across) {
+                            *out = line[low] + (line[high] - line[low]) * weight;
+                        }
                     }
                 }
                 let (a, b) = (&stretched[low % 2], &stretched[high % 2]);
@@ -87,45 +80,37 @@ fn resize(planes: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across: &[T
                     *out = a + (b - a) * weight;
                 }
             }
-        },
-    );
-    out
-}
-
-fn stretch(row: &[f32], across: &[Tap], out: &mut [f32]) {
-    for (out, &(low, high, weight)) in out.iter_mut().zip(across) {
-        *out = row[low] + (row[high] - row[low]) * weight;
+        });
+        (out, None)
     }
-}
 
-/// Gradient of the planes `[count, rows, columns]` of [`resize`], from the gradient of its result
-/// `[count, down.len(), across.len()]`.
-fn resize_gradient(gradient: &[f32], [rows, columns]: [usize; 2], down: &[Tap], across: &[Tap]) -> Vec<f32> {
-    let size = down.len() * across.len();
-    let mut out = take(gradient.len() / size * rows * columns);
-    let width = across.len();
-    let (down, across) = (uses(down, rows), uses(across, columns));
-    let tasks = out.par_chunks_exact_mut(rows * columns).zip(gradient.par_chunks_exact(size));
-    tasks.for_each_init(
-        || vec![0.0; width],
-        |sum, (out, gradient)| {
-            // Rows are summed first, because whole rows are vectors.
-            for (uses, out) in down.iter().zip(out.chunks_exact_mut(columns)) {
-                sum.fill(0.0);
-                for &(from, weight) in uses {
-                    let line = &gradient[from * width..][..width];
-                    vectorized(
-                        #[inline(always)]
-                        || sum.iter_mut().zip(line).for_each(|(sum, x)| *sum += weight * x),
-                    );
+    fn backward(&self, Given { upstream, .. }: Given) -> InputGradients {
+        let [batch, channels, rows, columns] = self.from;
+        let (width, size) = (self.across.len(), self.down.len() * self.across.len());
+        let mut out = take(batch * channels * rows * columns);
+        let (down, across) = (uses(&self.down, rows), uses(&self.across, columns));
+        let planes = out.par_chunks_exact_mut(rows * columns).zip(upstream.par_chunks_exact(size));
+        planes.for_each_init(
+            || vec![0.0; width],
+            |sum, (out, gradient)| {
+                // Rows are summed first, because whole rows are vectors.
+                for (uses, out) in down.iter().zip(out.chunks_exact_mut(columns)) {
+                    sum.fill(0.0);
+                    for &(from, weight) in uses {
+                        let line = &gradient[from * width..][..width];
+                        vectorized(
+                            #[inline(always)]
+                            || sum.iter_mut().zip(line).for_each(|(sum, x)| *sum += weight * x),
+                        );
+                    }
+                    for (out, uses) in out.iter_mut().zip(&across) {
+                        *out = uses.iter().map(|&(from, weight)| weight * sum[from]).sum();
+                    }
                 }
-                for (out, uses) in out.iter_mut().zip(&across) {
-                    *out = uses.iter().map(|&(from, weight)| weight * sum[from]).sum();
-                }
-            }
-        },
-    );
-    out
+            },
+        );
+        [Some(out), None, None]
+    }
 }
 
 /// The transpose of taps: for each of `count` positions that are read, the positions that are written from it in their

@@ -4,7 +4,7 @@ use burn::tensor::Tensor;
 use burn::tensor::module::attention;
 
 use crate::device::{has_kernels, host};
-use crate::op::{self, InputGradients, Kept, Kernel};
+use crate::op::{self, Given, InputGradients, Kept, Kernel};
 use crate::operators::Attention;
 use crate::rope::Rope;
 
@@ -69,13 +69,7 @@ impl Kernel for Attend {
         (out, keep.then(|| Box::new(logarithms) as _))
     }
 
-    fn backward(
-        &self,
-        inputs: [&[f32]; 3],
-        kept: Kept,
-        upstream: &[f32],
-        wanted: [bool; 3],
-    ) -> InputGradients {
+    fn backward(&self, Given { inputs, kept, upstream, wanted }: Given) -> InputGradients {
         let logarithms =
             kept.and_then(|kept| kept.downcast::<Vec<f32>>().ok()).expect("kept by the forward pass");
         let tables = self.tables.each_ref().map(Vec::as_slice);

@@ -91,7 +91,7 @@ pub struct Stage1Config {
 }
 
 /// The section `[stage2]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Stage2Config {
     /// Whether views follow the published curriculum: the sides with a penalty on scales, then front and back, then
@@ -119,12 +119,6 @@ impl Default for TrainingConfig {
             preview_every: 2000,
             precision: Precision::F32,
         }
-    }
-}
-
-impl Default for Stage2Config {
-    fn default() -> Self {
-        Self { curriculum: false, alpha_weight: 0.0, points_weight: 0.0 }
     }
 }
 

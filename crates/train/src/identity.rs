@@ -78,13 +78,8 @@ impl Identity {
         Ok(Self { config: own, data, validated, predictor })
     }
 
-    /// Differences from the identity `there`.
-    pub fn differences(&self, there: &Self) -> Vec<String> {
-        self.sorted(there).concat()
-    }
-
     /// Differences from the identity `there`: of the networks, and of everything else.
-    fn sorted(&self, there: &Self) -> [Vec<String>; 2] {
+    pub fn differences(&self, there: &Self) -> [Vec<String>; 2] {
         let mut harmful = Vec::new();
         let mut harmless = Vec::new();
         for (key, message) in differences(&there.config, &self.config) {
@@ -114,7 +109,7 @@ impl Identity {
 
     /// Why a run with the identity `there` cannot be continued as this one, or not without `force`.
     pub fn refusal(&self, there: &Self, force: bool) -> Option<String> {
-        let [harmful, harmless] = self.sorted(there);
+        let [harmful, harmless] = self.differences(there);
         let message =
             |differences: &[String]| format!("is the state of another run: {}", differences.join("; "));
         match (harmful.is_empty(), harmless.is_empty() || force) {

@@ -122,7 +122,7 @@ impl<'a, T: Task> Learner<'a, T> {
         let all = self.ranks.gather(&own);
         let (first, times, hash, host) = &all[0];
         for (rank, (there, other_times, other_hash, other_host)) in all.iter().enumerate() {
-            let mut differences = first.differences(there);
+            let mut differences = first.differences(there).concat();
             if times != other_times {
                 differences.push("the numbers of steps differ".to_owned());
             }

@@ -111,11 +111,6 @@ impl Ranks {
         }
     }
 
-    /// Waits until all ranks are here.
-    pub fn meet(&self) {
-        self.gather(&());
-    }
-
     /// Replaces `values` by their sums over all ranks, in the order of the ranks. All ranks get the same bytes.
     pub fn sum(&self, values: &mut [f32]) {
         if self.size > 1 {

@@ -308,7 +308,7 @@ impl<'a, T: Task> Session<'a, T> {
     /// Saves before the session ends. No rank ends before the first one has written.
     fn save_last(&mut self) -> Result<(), TrainError> {
         self.save()?;
-        self.options.ranks.meet();
+        self.options.ranks.gather(&());
         Ok(())
     }
 

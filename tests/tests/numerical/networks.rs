@@ -112,7 +112,7 @@ fn gaussian_regressor_and_its_activations() {
     let features = regressors[0].forward(input);
     assert_close("features", features.clone(), &io.f32("features"), POINTS);
     let [b, h, w, c] = features.dims();
-    let attributes = Attributes::from_features(features.reshape([b * h * w, c]));
+    let attributes = Attributes::new(features.reshape([b * h * w, c]), None);
     let map = |x: Tensor<2>| {
         let c = x.dims()[1];
         x.reshape([b, h, w, c])

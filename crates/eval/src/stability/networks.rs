@@ -173,7 +173,7 @@ fn attributes(device: &Device) -> Found {
         .flat_map(|v| (0..14).map(move |i| if i % 2 == 0 { *v } else { -*v }))
         .collect();
     let x = tracked(rows, [2, 14], device);
-    let made = Attributes::from_features(x.clone());
+    let made = Attributes::new(x.clone(), None);
     let made = Tensor::cat(vec![made.opacity, made.scale, made.rotation, made.color, made.offset], 1);
     let gradient = gradient_of_sum(&made, &x);
     let made = host(made);

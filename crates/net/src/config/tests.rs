@@ -58,14 +58,3 @@ fn possible_combinations_are_accepted() {
     config(COMPLETED, &[]).expect("valid");
     config(CLOSED, &["regressor.start=geometric"]).expect("valid");
 }
-
-#[test]
-fn the_reach_of_the_silhouettes_is_in_force_with_their_margin() {
-    for (set, reach) in [
-        (&[][..], 0.0),
-        (&["network.hull_margin=8"], 0.05),
-        (&["network.hull_margin=8", "network.hull_reach=0"], 0.0),
-    ] {
-        assert_eq!(config("", set).expect("valid").network.hull_reach(), reach, "{set:?}");
-    }
-}

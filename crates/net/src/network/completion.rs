@@ -181,8 +181,7 @@ pub(super) mod tests {
     use super::*;
     use crate::config::{Body, Config};
     use crate::network::predictor::Body as PredictorBody;
-    use crate::network::rays::nominal;
-    use crate::network::{Input, PointMap, anchors};
+    use crate::network::{Input, PointMap, PointPredictor, anchors, nominal_camera};
     use crate::parameters::{NamedMapper, ParameterPath, map_named};
     use crate::weights::random_predictor;
 
@@ -305,31 +304,40 @@ pub(super) mod tests {
         let seen = SideInput::new(View::Right, SIDE, &window, (points.clone(), table * 0.5), rows);
         let gradients = seen.depths[0].clone().sum().backward();
         let gradient = host(points.grad(&gradients).expect("a gradient"));
-        let axis = nominal(View::Right, OPPOSITE, SIDE).1.rotation.row(2).as_vec3().to_array();
+        let side = nominal_camera(View::Right, OPPOSITE, SIDE).world_to_camera;
+        let axis = side.rotation.row(2).as_vec3().to_array();
         for (i, gradient) in gradient.chunks_exact(3).enumerate() {
             let expected = if shown.contains(&(i as i32)) { axis } else { [0.0; 3] };
             assert!((0..3).all(|c| (gradient[c] - expected[c]).abs() < 1e-5), "{i}: {gradient:?}");
         }
     }
 
-    /// Points of all views from random photographs, by a predictor whose completion network corrects nothing.
-    fn uncorrected(both_ways: bool, b: usize) -> Vec<(View, Vec<f32>)> {
-        struct Nothing;
-        impl NamedMapper for Nothing {
+    /// The predictor, in which the output of the `layer` is this value everywhere.
+    pub fn with_output(predictor: PointPredictor, layer: &str, value: f64) -> PointPredictor {
+        struct Constant<'a>(&'a str, f64);
+        impl NamedMapper for Constant<'_> {
             fn map<const D: usize>(
                 &mut self,
                 path: &ParameterPath,
                 param: Param<Tensor<D>>,
             ) -> Param<Tensor<D>> {
-                match path.name().contains("completion.decoder.conv_out") {
-                    true => param.map(|values| values.zeros_like()),
-                    false => param,
+                let name = path.name();
+                if !name.contains(self.0) {
+                    return param;
                 }
+                let value = if name.ends_with("bias") { self.1 } else { 0.0 };
+                param.map(|values| values.zeros_like() + value)
             }
         }
+        map_named(predictor, "", &mut Constant(layer, value))
+    }
+
+    /// Points of all views from random photographs, by a predictor whose completion network corrects nothing.
+    fn uncorrected(both_ways: bool, b: usize) -> Vec<(View, Vec<f32>)> {
         let network = NetworkConfig { both_ways, delta: 0.02, ..config() };
         let config = Config { network, ..Config::default() };
-        let net = map_named(random_predictor(&config, 3, &Device::flex()), "", &mut Nothing);
+        let net = random_predictor(&config, 3, &Device::flex());
+        let net = with_output(net, "completion.decoder.conv_out", 0.0);
         let window = Window { rows: 0..SIDE, columns: 0..SIDE };
         let masks = (noise([2 * b, 1, SIDE, SIDE], 4) + 0.9).clamp(0.0, 1.0);
         let colors = noise([2 * b, 3, SIDE, SIDE], 3) * masks.clone();
@@ -354,14 +362,14 @@ pub(super) mod tests {
                 let mut covered = [0; 4];
                 for ((view, map), covered) in maps[2..].iter().zip(&mut covered) {
                     let anchors = host(anchors(*view, OPPOSITE, SIDE, &window, &Device::flex()));
-                    let (camera, to_side) = nominal(*view, OPPOSITE, SIDE);
+                    let camera = nominal_camera(*view, OPPOSITE, SIDE);
                     for (point, anchor) in of(map).chunks_exact(3).zip(anchors.chunks_exact(3)) {
                         let apart = |p: &[f32]| (0..3).map(|c| (p[c] - point[c]).powi(2)).sum::<f32>().sqrt();
                         if apart(anchor) < 1e-5 {
                             continue;
                         }
                         let nearest = known.chunks_exact(3).map(apart).fold(f32::INFINITY, f32::min);
-                        let depth = to_side.apply(Vec3::from_slice(point).as_dvec3()).z;
+                        let depth = camera.world_to_camera.apply(Vec3::from_slice(point).as_dvec3()).z;
                         let half_diagonal = 0.5_f64.sqrt() * depth / camera.focal.x;
                         assert!(
                             f64::from(nearest) < half_diagonal + 1e-4,

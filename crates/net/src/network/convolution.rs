@@ -13,7 +13,7 @@ use snapsnap_ops::bilinear;
 /// The convolutional body of the point predictor.
 #[derive(Module, Debug)]
 pub struct PointUNet {
-    body: UNet,
+    pub(super) body: UNet,
     side_attention: Option<Attention>,
     side_decoder: Option<Decoder>,
     pub(super) completion: Option<Completion>,
@@ -59,11 +59,6 @@ impl PointUNet {
     /// Both photographs `[B, C, H, W]`, H and W multiples of the patch.
     pub fn encode(&self, front: Tensor<4>, back: Tensor<4>) -> Levels {
         self.body.encode(Tensor::cat(vec![front, back], 1), None)
-    }
-
-    /// Features `[B, last_dim, h, w]` of the photographs' pixels.
-    pub fn features(&self, levels: &Levels) -> Tensor<4> {
-        self.body.features(levels)
     }
 
     /// Raw x, y, z, confidence `[B, 4, H, W]` of the front and the back from their features.

@@ -141,19 +141,49 @@ impl PointPredictor {
     ) -> SecondLook {
         let fine = self.details.as_ref().expect("a network of details").resolution;
         let [canvas, coarse] = [self.config.resolution, self.config.net_resolution];
+        let device = masks.device();
         let small = |x: Tensor<4>, size: usize| shrink(window.cut(x), canvas / size, Downsample::Area);
         let mask = |view: usize, size: usize| small(masks.clone().narrow(1, view, 1), size);
-        let colors = [0, 1].map(|view| small(images.clone().narrow(1, view, 1).squeeze_dim(1), fine));
         let larger =
             |map: PointMap, view: usize, size: usize| enlarged(map, size / coarse, Some(mask(view, coarse)));
-        let map = |view: usize| maps[view].1.clone();
-        let input = |view: usize| {
-            let nearby = mean_nearby(&maps[view].1, &mask(view, coarse));
-            [map(view), nearby].map(|map| larger(map, view, fine / PATCH))
+        let rays = |size: usize| {
+            let window = window.shrunk(canvas / size);
+            [View::Front, View::Back].map(|view| Rays::new(view, OPPOSITE, size, &window, &device))
         };
-        let large = [0, 1].map(|view| larger(map(view), view, fine));
-        let masks = [mask(0, fine), mask(1, fine)];
-        SecondLook::new(large, [input(0), input(1)], colors, masks, &window.shrunk(canvas / fine), fine)
+        let fine_masks = [0, 1].map(|view| mask(view, fine));
+        let shares = fine_masks.clone().map(|mask| shrink(mask, PATCH, Downsample::Area));
+        let [b, _, h, w] = shares[0].dims();
+        let patch_rays = rays(fine / PATCH);
+        // Of each photograph's points, and of the means nearby.
+        let distances = [0, 1].map(|view| {
+            let map = &maps[view].1;
+            let nearby = means(map.points.clone().permute([0, 3, 1, 2]), &mask(view, coarse));
+            let nearby = PointMap { points: nearby.permute([0, 2, 3, 1]), conf: map.conf.clone() };
+            let outside = shares[view].clone().lower_equal_elem(0.0);
+            [map.clone(), nearby].map(|map| {
+                let points = larger(map, view, fine / PATCH).points;
+                let distance = (points * patch_rays[view].forward.clone()).sum_dim(3);
+                (distance.permute([0, 3, 1, 2]) * shares[view].clone()).mask_fill(outside.clone(), 0.0)
+            })
+        });
+        let seen = [0, 1].map(|view| {
+            let colors = small(images.clone().narrow(1, view, 1).squeeze_dim(1), fine);
+            let [colors, mask] = [colors, fine_masks[view].clone()].map(patches);
+            let place = patch_rays[view].anchors().narrow(3, 0, 2).permute([0, 3, 1, 2]).expand([b, 2, h, w]);
+            let is_back = Tensor::full([b, 1, h, w], view as f32, &device);
+            // The plane through the axis shows the same place of the body to mirrored pixels of the other photograph.
+            let [other, other_mask] =
+                [&distances[1 - view][0], &shares[1 - view]].map(|x| x.clone().flip([3]));
+            let [distance, nearby] = distances[view].clone();
+            let relief = (distance.clone() - nearby) / UNIT;
+            Tensor::cat(vec![colors, mask, distance, relief, other, other_mask, is_back, place], 1)
+        });
+        SecondLook {
+            images: Tensor::cat(seen.to_vec(), 0),
+            maps: [0, 1].map(|view| larger(maps[view].1.clone(), view, fine)),
+            masks: fine_masks,
+            rays: rays(fine),
+        }
     }
 
     /// Movements along the rays `[N, 1, PATCH·h, PATCH·w]`, in network units, for images `[N, INPUTS, h, w]` of a [`SecondLook`] or for parts of them.
@@ -164,12 +194,6 @@ impl PointPredictor {
     pub fn relief(&self, images: Tensor<4>) -> Tensor<4> {
         self.details.as_ref().expect("a network of details").relief(images)
     }
-}
-
-/// Points with the mean of the person's points nearby, by its share of each pixel `[B, 1, h, w]`.
-fn mean_nearby(map: &PointMap, mask: &Tensor<4>) -> PointMap {
-    let points = means(map.points.clone().permute([0, 3, 1, 2]), mask);
-    PointMap { points: points.permute([0, 2, 3, 1]), conf: map.conf.clone() }
 }
 
 /// Means of the person's values nearby `[B, C, h, w]`, by its share of each pixel `[B, 1, h, w]`.
@@ -195,43 +219,6 @@ pub fn without_mean(x: Tensor<4>, inside: &Tensor<4>, factor: usize) -> Tensor<4
 }
 
 impl SecondLook {
-    /// `colors` are `[B, 3, h, w]` in [−1, 1]. The `window` of a canvas of `side`² pixels is symmetric. `inputs` are each
-    /// photograph's points and means nearby, enlarged to h/PATCH × w/PATCH.
-    pub(super) fn new(
-        maps: [PointMap; 2],
-        inputs: [[PointMap; 2]; 2],
-        colors: [Tensor<4>; 2],
-        masks: [Tensor<4>; 2],
-        window: &Window,
-        side: usize,
-    ) -> Self {
-        let device = masks[0].device();
-        let rays = |side: usize, window: &Window| {
-            [View::Front, View::Back].map(|view| Rays::new(view, OPPOSITE, side, window, &device))
-        };
-        let coarse_rays = rays(side / PATCH, &window.shrunk(PATCH));
-        let coarse = masks.clone().map(|mask| shrink(mask, PATCH, Downsample::Area));
-        let [b, _, h, w] = coarse[0].dims();
-        let distances = [0, 1].map(|i| {
-            let outside = coarse[i].clone().lower_equal_elem(0.0);
-            inputs[i].each_ref().map(|map| {
-                let distance = (map.points.clone() * coarse_rays[i].forward.clone()).sum_dim(3);
-                (distance.permute([0, 3, 1, 2]) * coarse[i].clone()).mask_fill(outside.clone(), 0.0)
-            })
-        });
-        let images = [0, 1].map(|i| {
-            let place = coarse_rays[i].anchors().narrow(3, 0, 2).permute([0, 3, 1, 2]).expand([b, 2, h, w]);
-            let is_back = Tensor::full([b, 1, h, w], i as f32, &device);
-            // The plane through the axis shows the same place of the body to mirrored pixels of the other photograph.
-            let [other, other_mask] = [&distances[1 - i][0], &coarse[1 - i]].map(|x| x.clone().flip([3]));
-            let [distance, nearby] = distances[i].clone();
-            let relief = (distance.clone() - nearby) / UNIT;
-            let [colors, mask] = [&colors[i], &masks[i]].map(|x| patches(x.clone()));
-            Tensor::cat(vec![colors, mask, distance, relief, other, other_mask, is_back, place], 1)
-        });
-        Self { images: Tensor::cat(images.to_vec(), 0), maps, masks, rays: rays(side, window) }
-    }
-
     /// h and w.
     pub fn size(&self) -> [usize; 2] {
         let [_, _, h, w] = self.masks[0].dims();
@@ -252,15 +239,13 @@ impl SecondLook {
 
 #[cfg(test)]
 mod tests {
-    use burn::module::Param;
     use burn::tensor::TensorData;
     use snapsnap_ops::host;
 
     use super::*;
     use crate::Prediction;
     use crate::config::{Config, NetworkConfig};
-    use crate::network::completion::tests::{SIDE, config as small};
-    use crate::parameters::{NamedMapper, ParameterPath, map_named};
+    use crate::network::completion::tests::{SIDE, config as small, with_output};
     use crate::steps::Record;
     use crate::weights::random_predictor;
 
@@ -278,23 +263,8 @@ mod tests {
 
     /// The predictor, whose network of details moves every point by `relief` network units.
     fn moving(config: &Config, relief: f32) -> PointPredictor {
-        struct Constant(f32);
-        impl NamedMapper for Constant {
-            fn map<const D: usize>(
-                &mut self,
-                path: &ParameterPath,
-                param: Param<Tensor<D>>,
-            ) -> Param<Tensor<D>> {
-                match path.name().as_str() {
-                    "details.decoder.conv_out.weight" => param.map(|values| values.zeros_like()),
-                    "details.decoder.conv_out.bias" => {
-                        param.map(|values| values.zeros_like() + f64::from(self.0) / UNIT)
-                    }
-                    _ => param,
-                }
-            }
-        }
-        map_named(random_predictor(config, 3, &Device::flex()), "", &mut Constant(relief))
+        let predictor = random_predictor(config, 3, &Device::flex());
+        with_output(predictor, "details.decoder.conv_out", f64::from(relief) / UNIT)
     }
 
     /// Points of all views of a person in the middle of both photographs.
@@ -377,33 +347,25 @@ mod tests {
     fn depths_behind_are_measured_in_each_photographs_camera() {
         let device = Device::flex();
         let window = Window::whole(SIDE);
+        // A pixel of the predictor is two pixels wide.
+        let side = SIDE / 2;
         let noise = |seed: usize| -> Vec<f32> {
-            (0..3 * SIDE * SIDE).map(|i| 0.3 * ((i * 7 + seed) as f32).sin()).collect()
+            (0..3 * side * side).map(|i| 0.3 * ((i * 7 + seed) as f32).sin()).collect()
         };
         let map = |seed: usize| PointMap {
-            points: Tensor::from_data(TensorData::new(noise(seed), [1, SIDE, SIDE, 3]), &device),
-            conf: Tensor::ones([1, SIDE, SIDE], &device),
+            points: Tensor::from_data(TensorData::new(noise(seed), [1, side, side, 3]), &device),
+            conf: Tensor::ones([1, side, side], &device),
         };
-        let maps = [map(1), map(2)];
-        let nothing = || PointMap {
-            points: Tensor::zeros([1, SIDE / PATCH, SIDE / PATCH, 3], &device),
-            conf: Tensor::ones([1, SIDE / PATCH, SIDE / PATCH], &device),
-        };
-        let inputs = || [nothing(), nothing()];
-        let mask = || Tensor::ones([1, 1, SIDE, SIDE], &device);
-        let colors = || Tensor::zeros([1, 3, SIDE, SIDE], &device);
-        let look = SecondLook::new(
-            maps.clone(),
-            [inputs(), inputs()],
-            [colors(), colors()],
-            [mask(), mask()],
-            &window,
-            SIDE,
-        );
+        let config = config(Some(SIDE));
+        let predictor = random_predictor(&config, 3, &device);
+        let (images, masks) =
+            (Tensor::zeros([1, 2, 3, SIDE, SIDE], &device), Tensor::ones([1, 2, SIDE, SIDE], &device));
+        let maps = [(View::Front, map(1)), (View::Back, map(2))];
+        let look = predictor.second_look(&maps, &images, &masks, &window);
         assert_eq!(look.images.dims(), [2, INPUTS, SIDE / PATCH, SIDE / PATCH]);
         let points = [(View::Front, 0.03), (View::Back, -0.05)].map(|(view, depth)| {
             let rays = Rays::new(view, OPPOSITE, SIDE, &window, &device);
-            rays.anchors() + maps[view as usize].points.clone() * 0.2 + rays.directions * depth
+            rays.anchors() + look.maps[view as usize].points.clone() * 0.2 + rays.directions * depth
         });
         let behind = host(look.depths_behind(points, 0.2));
         for (i, depth) in behind.iter().enumerate() {

@@ -12,7 +12,7 @@ use super::input::Input;
 use super::rays::{anchors, on_rays};
 use super::unet::Levels;
 use super::view::View;
-use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Sides, Upsample};
+use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Upsample};
 use crate::resample::shrink;
 use crate::window::Window;
 use snapsnap_ops::bilinear;
@@ -205,16 +205,6 @@ impl PointPredictor {
         }
     }
 
-    /// Whether the unseen sides have heads of their own.
-    pub fn has_side_heads(&self) -> bool {
-        self.views().len() > 2 && self.config.sides == Sides::Predicted
-    }
-
-    /// Side of the canvas in the image that a second network receives to refine the photographs' points.
-    pub fn details_resolution(&self) -> Option<usize> {
-        self.details.as_ref().map(|details| details.resolution)
-    }
-
     /// Whether the layer of this name in a checkpoint outputs raw points.
     pub(crate) fn is_last_layer(name: &str) -> bool {
         Dust3r::is_last_layer(name) || name.ends_with("decoder.conv_out")
@@ -238,20 +228,6 @@ impl PointPredictor {
         PointMap { points: self.times_delta(points), conf }
     }
 
-    /// Adds the anchors of a window to a view's map: corrections in metres become points in the front camera's frame.
-    /// Without anchors the map stays as it is.
-    pub fn add_anchors(&self, view: View, map: PointMap, window: &Window) -> PointMap {
-        let config = &self.config;
-        match config.anchor {
-            Anchor::None => map,
-            Anchor::Ray => {
-                let anchors =
-                    anchors(view, config.pair_degrees, config.resolution, window, &map.points.device());
-                PointMap { points: map.points + anchors, ..map }
-            }
-        }
-    }
-
     /// Enlarges a map to the canvas pixels of the `window` that the network received, and adds the anchors. Points are
     /// then metres in the front camera's frame. `mask` `[B, 1, S, S]` is the photograph's mask. Sides have no mask:
     /// their person is where the predicted confidence exceeds the threshold, without a gradient.
@@ -272,7 +248,12 @@ impl PointPredictor {
                 person.float().unsqueeze_dim(1)
             }
         });
-        self.add_anchors(view, self.enlarged(map, factor, weights), window)
+        let map = self.enlarged(map, factor, weights);
+        let NetworkConfig { anchor: Anchor::Ray, pair_degrees, resolution, .. } = self.config else {
+            return map;
+        };
+        let anchors = anchors(view, pair_degrees, resolution, window, &map.points.device());
+        PointMap { points: map.points + anchors, ..map }
     }
 
     /// The encoder: a transformer reads each photograph alone, a convolution both together.
@@ -296,7 +277,7 @@ impl PointPredictor {
                 Decoded::Tokens(net.decode(front, back, grid), grid)
             }
             (Body::Convolution(net), Encoded::Levels(levels)) => {
-                let features = net.features(&levels);
+                let features = net.body.features(&levels);
                 Decoded::Levels(levels, features)
             }
             _ => panic!("encoded by another network"),

@@ -4,7 +4,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use glam::{DVec2, DVec3};
-use snapsnap_splat::{Camera, RigidTransform};
+use snapsnap_splat::Camera;
 
 use super::View;
 use crate::window::Window;
@@ -19,16 +19,11 @@ fn yaw(view: View, pair_degrees: f64) -> f64 {
     }
 }
 
-/// A view's nominal camera of a canvas of `side`² pixels, and the transform from the front camera's frame.
-pub(crate) fn nominal(view: View, pair_degrees: f64, side: usize) -> (Camera, RigidTransform) {
-    let [front, camera] =
-        [0.0, yaw(view, pair_degrees)].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, side as u32));
-    (camera, front.world_to_camera.inverse().then(&camera.world_to_camera))
-}
-
 /// A view's nominal camera of a canvas of `side`² pixels. Its world is the front camera's frame.
 pub(crate) fn nominal_camera(view: View, pair_degrees: f64, side: usize) -> Camera {
-    let (camera, world_to_camera) = nominal(view, pair_degrees, side);
+    let [front, camera] =
+        [0.0, yaw(view, pair_degrees)].map(|yaw| Camera::orbit_at_yaw_degrees(yaw, side as u32));
+    let world_to_camera = front.world_to_camera.inverse().then(&camera.world_to_camera);
     Camera { world_to_camera, ..camera }
 }
 
@@ -52,8 +47,8 @@ pub(super) struct Rays {
 
 impl Rays {
     pub(super) fn new(view: View, pair_degrees: f64, side: usize, window: &Window, device: &Device) -> Self {
-        let (camera, from_front) = nominal(view, pair_degrees, side);
-        let to_front = from_front.inverse();
+        let camera = Camera::orbit_at_yaw_degrees(yaw(view, pair_degrees), side as u32);
+        let to_front = nominal_camera(view, pair_degrees, side).world_to_camera.inverse();
         let centre = camera.centre();
         // The plane's normal: horizontal (the world's y is up), towards the camera.
         let normal = camera.world_to_camera.rotation * DVec3::new(centre.x, 0.0, centre.z).normalize();

@@ -1,10 +1,10 @@
 //! The points of both photographs as the camera of an unseen side sees them (docs/method.md, "Completed sides").
 
 use burn::tensor::Tensor;
-use glam::DVec3;
+use glam::Vec3;
 
 use super::View;
-use super::rays::nominal;
+use super::rays::nominal_camera;
 use crate::config::OPPOSITE;
 use crate::window::Window;
 use snapsnap_ops::gather::NONE;
@@ -30,21 +30,20 @@ impl Visible {
         [points, inside]: [&[f32]; 2],
         batch: usize,
     ) -> Self {
-        let (camera, to_side) = nominal(view, OPPOSITE, side);
+        let camera = nominal_camera(view, OPPOSITE, side);
         let (n, w) = (inside.len() / batch, window.columns.len());
         let area = window.rows.len() * w;
         let mut found: [Vec<i32>; 3] = Default::default();
         for (sample, (points, inside)) in points.chunks_exact(3 * n).zip(inside.chunks_exact(n)).enumerate() {
             let seen = |(i, point): (usize, &[f32])| {
-                let p = to_side.apply(DVec3::new(point[0].into(), point[1].into(), point[2].into()));
-                let place = camera.focal * p.truncate() / p.z + camera.principal_point;
-                let there = p.z > 0.0 && place.is_finite() && place.min_element() >= 0.0;
+                let (place, depth) = camera.project(Vec3::from_slice(point).as_dvec3())?;
                 let (column, row) = (place.x as usize, place.y as usize);
+                let there = place.is_finite() && place.min_element() >= 0.0;
                 if !there || !window.rows.contains(&row) || !window.columns.contains(&column) {
                     return None;
                 }
                 let pixel = (row - window.rows.start) * w + column - window.columns.start;
-                Some((pixel, p.z, (sample * n + i) as i32))
+                Some((pixel, depth, (sample * n + i) as i32))
             };
             let of_person = points.chunks_exact(3).enumerate().filter(|(i, _)| inside[*i] >= 0.5);
             let seen: Vec<(usize, f64, i32)> = of_person.filter_map(seen).collect();
@@ -72,7 +71,7 @@ impl Visible {
 
 /// Depths `[B, N, 1]` of points `[B, N, 3]` (metres, front camera's frame) from the camera of `view`.
 pub fn depths(view: View, points: Tensor<3>) -> Tensor<3> {
-    let (_, to_side) = nominal(view, OPPOSITE, 1);
+    let to_side = nominal_camera(view, OPPOSITE, 1).world_to_camera;
     let axis = to_side.rotation.row(2).as_vec3().to_array();
     let axis = Tensor::<3>::from_data([[axis]], &points.device());
     (points * axis).sum_dim(2) + to_side.translation.z
@@ -89,8 +88,8 @@ mod tests {
 
     /// Points in the front camera's frame that the camera of `view` sees at these pixels and depths.
     fn seen(view: View, places: &[(f64, f64, f64)]) -> Vec<f32> {
-        let (camera, to_side) = nominal(view, OPPOSITE, SIDE);
-        let back = to_side.inverse();
+        let camera = nominal_camera(view, OPPOSITE, SIDE);
+        let back = camera.world_to_camera.inverse();
         let point = |&(column, row, depth): &(f64, f64, f64)| {
             let ray = (DVec2::new(column, row) - camera.principal_point) / camera.focal;
             back.apply(ray.extend(1.0) * depth).as_vec3().to_array()

@@ -6,6 +6,7 @@ use glam::Vec3;
 use snapsnap_splat::{Camera, RigidTransform};
 
 use crate::config::RegressorConfig;
+use crate::painter::CanvasView;
 
 /// Gaussian attributes of N pixels.
 #[derive(Debug, Clone)]
@@ -62,16 +63,9 @@ const LOG_SCALE: f64 = 2.0;
 const MOST_SPACING: f32 = 3.0;
 
 impl Geometry {
-    /// The geometry of a view's valid pixels, row by row, from colours `[3, S, S]` and points `[S, S, 3]`. The world
-    /// of `camera` is the frame of the points.
-    pub fn new(
-        image: &[f32],
-        points: &[f32],
-        valid: &[bool],
-        camera: &Camera,
-        limits: Limits,
-        device: &Device,
-    ) -> Self {
+    /// The geometry of a view's valid pixels, row by row. The world of `camera` is the frame of the points.
+    pub fn new(view: &CanvasView, camera: &Camera, limits: Limits, device: &Device) -> Self {
+        let CanvasView { image, points, valid, .. } = *view;
         let side = camera.width as usize;
         let RigidTransform { rotation, translation } = camera.world_to_camera;
         let depth = |point: Vec3| (rotation.row(2).dot(point.as_dvec3()) + translation.z) as f32;
@@ -102,12 +96,19 @@ impl Geometry {
 }
 
 impl Attributes {
-    /// Attributes of features `[N, 14]`: corrections of the `geometry`, if there is one.
+    /// Attributes of features `[N, 14]`, opacity, scale, rotation, colour and offset: corrections of the `geometry`, or,
+    /// without one, activated as in the published code.
     pub fn new(features: Tensor<2>, geometry: Option<Geometry>) -> Self {
-        let Some(Geometry { spacing, colors, limits }) = geometry else {
-            return Self::from_features(features);
-        };
         let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
+        let Some(Geometry { spacing, colors, limits }) = geometry else {
+            return Self {
+                opacity: sigmoid(part(0, 1)),
+                scale: sharp_softplus(part(1, 3)),
+                rotation: unit(part(4, 4)),
+                color: part(8, 3).tanh(),
+                offset: part(11, 3) * 0.001,
+            };
+        };
         let upright = Tensor::from_data([[1.0, 0.0, 0.0, 0.0]], &features.device());
         Self {
             opacity: sigmoid(part(0, 1) + START_OPACITY) * (1.0 - limits.opacity) + limits.opacity,
@@ -116,31 +117,6 @@ impl Attributes {
             // Small corrections are the same for every limit.
             color: colors + (part(8, 3) / limits.color).tanh() * limits.color,
             offset: part(11, 3) * spacing,
-        }
-    }
-
-    /// The attributes of several parts, one part after the other.
-    pub fn joined(parts: Vec<Self>) -> Self {
-        let join =
-            |of: fn(&Self) -> &Tensor<2>| Tensor::cat(parts.iter().map(|part| of(part).clone()).collect(), 0);
-        Self {
-            opacity: join(|part| &part.opacity),
-            scale: join(|part| &part.scale),
-            rotation: join(|part| &part.rotation),
-            color: join(|part| &part.color),
-            offset: join(|part| &part.offset),
-        }
-    }
-
-    /// Features `[N, 14]`: opacity, scale, rotation, colour, offset, activated as in the published code.
-    pub fn from_features(features: Tensor<2>) -> Self {
-        let part = |from: usize, width: usize| features.clone().narrow(1, from, width);
-        Self {
-            opacity: sigmoid(part(0, 1)),
-            scale: sharp_softplus(part(1, 3)),
-            rotation: unit(part(4, 4)),
-            color: part(8, 3).tanh(),
-            offset: part(11, 3) * 0.001,
         }
     }
 }

@@ -6,7 +6,7 @@ use burn::module::Param;
 use burn::nn::conv::Conv2d;
 use burn::tensor::Tensor;
 use snapsnap_ops::fused::Needed;
-use snapsnap_ops::op::{self, InputGradients, Kept, Kernel};
+use snapsnap_ops::op::{self, Given, InputGradients, Kept, Kernel};
 use snapsnap_ops::regressor::{FEATURES, Network, Saved};
 
 use super::unet::UNet;
@@ -30,15 +30,10 @@ impl Kernel for Pass {
         (features, saved.map(|saved| Box::new(saved) as _))
     }
 
-    fn backward(
-        &self,
-        [input, parameters, _]: [&[f32]; 3],
-        kept: Kept,
-        upstream: &[f32],
-        [wants_input, wants_parameters, _]: [bool; 3],
-    ) -> InputGradients {
+    fn backward(&self, given: Given) -> InputGradients {
+        let Given { inputs: [input, parameters, _], kept, upstream, wanted } = given;
         let saved = kept.and_then(|kept| kept.downcast::<Saved>().ok()).expect("kept by the forward pass");
-        let wanted = Needed { input: wants_input, parameters: wants_parameters };
+        let wanted = Needed { input: wanted[0], parameters: wanted[1] };
         let [input, parameters] = self.network.backward(parameters, input, *saved, upstream, wanted);
         [input, parameters, None]
     }
@@ -47,30 +42,23 @@ impl Kernel for Pass {
 /// Input `[B, 6, H, W]` → features `[B, H, W, 14]`: `unet`, then the 1×1 convolution `last`.
 pub fn regress(unet: &UNet, last: &Conv2d, input: Tensor<4>) -> Tensor<4> {
     let [b, _, h, w] = input.dims();
-    let (network, parameters) = flat(unet, last);
+    let network = Network::default();
+    let parameters = flat(&network, unet, last);
     let none: Option<Tensor<1>> = None;
     op::run(Pass { network, size: [b, h, w] }, input.permute([0, 2, 3, 1]), Some(parameters), none)
 }
 
-/// The network's layout, and all parameters in its order.
-fn flat(unet: &UNet, last: &Conv2d) -> (Network, Tensor<1>) {
-    #[derive(Default)]
-    struct Collect {
-        shapes: HashMap<String, Vec<usize>>,
-        values: HashMap<String, Tensor<1>>,
-    }
+/// All parameters in the order of the network's layout.
+fn flat(network: &Network, unet: &UNet, last: &Conv2d) -> Tensor<1> {
+    struct Collect(HashMap<String, Tensor<1>>);
     impl NamedVisitor for Collect {
         fn visit<const D: usize>(&mut self, path: &ParameterPath, parameter: &Param<Tensor<D>>) {
-            let (name, values) = (path.name(), parameter.val());
-            self.shapes.insert(name.clone(), values.dims().to_vec());
-            self.values.insert(name, values.reshape([-1]));
+            self.0.insert(path.name(), parameter.val().reshape([-1]));
         }
     }
-    let mut collect = Collect::default();
+    let mut collect = Collect(HashMap::new());
     visit_named(unet, "", &mut collect);
     visit_named(last, "gs_conv.", &mut collect);
-    let network = Network::new(&collect.shapes);
-    let mut values = |name: &str| collect.values.remove(name).expect("the layout names existing parameters");
-    let flat = Tensor::cat(network.names().iter().map(|name| values(name)).collect(), 0);
-    (network, flat)
+    let values = |name: &String| collect.0.remove(name).expect("the layout names existing parameters");
+    Tensor::cat(network.names().iter().map(values).collect(), 0)
 }

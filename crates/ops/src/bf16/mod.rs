@@ -33,11 +33,6 @@ pub type Columns = [u32; PANEL];
 /// A block of sums. A kernel fills its first rows.
 type Sums = [[f32; PANEL]; SLACK];
 
-/// Rows of the kernel's next block of sums, if `left` rows remain.
-fn block_rows(left: usize) -> usize {
-    left.next_multiple_of(4).min(12)
-}
-
 /// Whether this processor has the instructions.
 pub fn is_there() -> bool {
     #[cfg(target_arch = "x86_64")]
@@ -123,7 +118,7 @@ pub fn product(
             let count = (columns - column).min(PANEL);
             let mut row = 0;
             while row < rows {
-                let height = block_rows(rows - row);
+                let height = (rows - row).next_multiple_of(4).min(12);
                 avx512::block(&left[row..], packed, height, count, panel, &mut sums);
                 for (i, sums) in sums[..height.min(rows - row)].iter().enumerate() {
                     each(row + i, column, &sums[..count]);

@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use super::elements::{add_constant, mask, rectify, total};
-use super::{Layer, join};
+use super::{Convolution, join};
 use crate::buffers::{Floats, take};
 use crate::multiply::{Right, product};
 use crate::op::InputGradients;
@@ -15,23 +15,6 @@ const BLOCK_FLOATS: usize = 32 * 1024;
 /// Largest number of partial sums of the weight's gradient, which are then added in a fixed order.
 const PARTS: usize = 16;
 
-/// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
-#[derive(Debug, Clone, Copy)]
-pub struct Conv1x1 {
-    /// Images.
-    pub batch: usize,
-    /// Channels of the input.
-    pub inputs: usize,
-    /// Channels of the output.
-    pub outputs: usize,
-    /// Height times width.
-    pub pixels: usize,
-    /// Reads max(x, 0).
-    pub rectified: bool,
-    /// Products in bf16, if the processor has the instructions.
-    pub in_bf16: bool,
-}
-
 /// Some pixels of one image, and the slices for their results, channel by channel.
 struct Block<'a> {
     image: usize,
@@ -40,12 +23,10 @@ struct Block<'a> {
     out: Vec<&'a mut [f32]>,
 }
 
-impl Layer for Conv1x1 {
-    type Kept = ();
-
-    /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs]`, `bias` `[outputs]` → `[B, outputs, H, W]`.
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
-        let Self { inputs, outputs, pixels, .. } = *self;
+impl Convolution {
+    /// The result of a 1×1 convolution.
+    pub(super) fn pointwise(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
+        let (Self { inputs, outputs, .. }, pixels) = (*self, self.pixels());
         let mut out = take(self.batch * outputs * pixels);
         self.blocks(Some((&mut out, outputs))).into_par_iter().for_each(|block| {
             let (n, x) = (block.count, &x[block.image * inputs * pixels + block.first..]);
@@ -58,37 +39,33 @@ impl Layer for Conv1x1 {
                 add_constant(results, bias, out);
             }
         });
-        (out, ())
+        out
     }
 
-    /// Gradients from the output's gradient `dy` `[B, outputs, H, W]`.
-    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: [bool; 3]) -> InputGradients {
+    /// The gradients of a 1×1 convolution.
+    pub(super) fn pointwise_gradients(&self, given: [&[f32]; 3], wanted: [bool; 3]) -> InputGradients {
         let [of_input, of_weight, of_bias] = wanted;
         let Self { inputs, outputs, .. } = *self;
-        let mut dx = of_input.then(|| take(x.len()));
+        let mut dx = of_input.then(|| take(given[0].len()));
         let mut blocks = self.blocks(dx.as_deref_mut().map(|dx| (dx, inputs)));
         let size = blocks.len().div_ceil(PARTS);
         let parts: Vec<_> =
-            blocks.par_chunks_mut(size).map(|part| self.part(part, x, weight, dy, wanted)).collect();
+            blocks.par_chunks_mut(size).map(|part| self.of_blocks(part, given, wanted)).collect();
         [
             dx,
             of_weight.then(|| join(parts.iter().map(|(weights, _)| &weights[..]), outputs * inputs)),
             of_bias.then(|| join(parts.iter().map(|(_, biases)| &biases[..]), outputs)),
         ]
     }
-}
 
-impl Conv1x1 {
     /// The gradients of some blocks. Returns the weight's and the bias's gradients, empty if unwanted.
-    fn part(
+    fn of_blocks(
         &self,
         part: &mut [Block],
-        x: &[f32],
-        weight: &[f32],
-        dy: &[f32],
+        [x, weight, dy]: [&[f32]; 3],
         [of_input, of_weight, of_bias]: [bool; 3],
     ) -> (Vec<f32>, Vec<f32>) {
-        let Self { inputs, outputs, pixels, rectified, .. } = *self;
+        let (Self { inputs, outputs, rectified, .. }, pixels) = (*self, self.pixels());
         let mut weights = vec![0.0; if of_weight { outputs * inputs } else { 0 }];
         let mut biases = vec![0.0; if of_bias { outputs } else { 0 }];
         let mut add = false;
@@ -126,9 +103,9 @@ impl Conv1x1 {
     /// The first `n` pixels of the (rectified) input: values and their (column, row) strides.
     fn read<'a>(&self, x: &'a [f32], n: usize, read: &'a mut [f32]) -> (&'a [f32], [usize; 2]) {
         if !self.rectified {
-            return (x, [1, self.pixels]);
+            return (x, [1, self.pixels()]);
         }
-        for (read, x) in read.chunks_exact_mut(n).zip(x.chunks(self.pixels)) {
+        for (read, x) in read.chunks_exact_mut(n).zip(x.chunks(self.pixels())) {
             rectify(&x[..n], read);
         }
         (read, [1, n])
@@ -136,7 +113,7 @@ impl Conv1x1 {
 
     /// All blocks, with their slices of `out` `[B, channels, H, W]`, if there is an output.
     fn blocks<'a>(&self, out: Option<(&'a mut [f32], usize)>) -> Vec<Block<'a>> {
-        let Self { batch, pixels, .. } = *self;
+        let (batch, pixels) = (self.batch, self.pixels());
         let piece = (BLOCK_FLOATS / (self.inputs + self.outputs)).next_multiple_of(64).min(pixels);
         let mut blocks: Vec<_> = (0..batch)
             .flat_map(|image| (0..pixels).step_by(piece).map(move |first| (image, first)))

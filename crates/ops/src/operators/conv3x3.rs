@@ -12,8 +12,8 @@
 use pulp::Arch;
 use rayon::prelude::*;
 
+use super::Convolution;
 use super::elements::channel_sums;
-use super::{Layer, Unfolded};
 use crate::buffers::{Floats, take};
 use crate::op::InputGradients;
 use crate::winograd::planes::{Planes, Scatter};
@@ -28,44 +28,23 @@ const BLOCK_FLOATS: usize = 256 * 1024;
 /// few pixels only, the gradients of some taps are 0. Winograd's method would round, and AdamW scale up the rounding.
 const FEW_PIXELS: usize = 1024;
 
-/// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
-#[derive(Debug, Clone, Copy)]
-pub struct Conv3x3 {
-    /// Images.
-    pub batch: usize,
-    /// Channels of the input.
-    pub inputs: usize,
-    /// Channels of the output.
-    pub outputs: usize,
-    /// Rows.
-    pub height: usize,
-    /// Columns.
-    pub width: usize,
-    /// Reads max(x, 0).
-    pub rectified: bool,
-}
-
-impl Layer for Conv3x3 {
-    type Kept = ();
-
-    /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` → `[B, outputs, H, W]`.
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
+impl Convolution {
+    /// The result of a 3×3 convolution with stride 1.
+    pub(super) fn winograd(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
         let filters = self.transformed(weight, [9 * self.inputs, 9], false);
-        (self.run(x, &filters, bias, None), ())
+        self.run(x, &filters, bias, None)
     }
 
-    /// Gradients from the output's gradient `dy` `[B, outputs, H, W]`.
-    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: [bool; 3]) -> InputGradients {
-        let [of_input, of_weight, of_bias] = wanted;
+    /// The gradients of a 3×3 convolution with stride 1.
+    pub(super) fn winograd_gradients(&self, given: [&[f32]; 3], wanted: [bool; 3]) -> InputGradients {
+        let ([x, weight, dy], [of_input, of_weight, of_bias]) = (given, wanted);
         let input = of_input.then(|| {
             let back = Self { inputs: self.outputs, outputs: self.inputs, rectified: false, ..*self };
             let filters = back.transformed(weight, [9, 9 * self.inputs], true);
             back.run(dy, &filters, None, self.rectified.then_some(x))
         });
-        if of_weight && self.batch * self.height * self.width <= FEW_PIXELS {
-            let Self { batch, inputs, outputs, height, width, rectified } = *self;
-            let direct = Unfolded { batch, inputs, outputs, height, width, stride: 1, rectified };
-            let [_, weight, bias] = direct.backward(x, weight, (), dy, [false, true, of_bias]);
+        if of_weight && self.batch * self.pixels() <= FEW_PIXELS {
+            let [_, weight, bias] = self.unfolded_gradients(given, [false, true, of_bias]);
             [input, weight, bias]
         } else if of_weight {
             // The gradient of the bias is a by-product.
@@ -75,9 +54,7 @@ impl Layer for Conv3x3 {
             [input, None, of_bias.then(|| channel_sums(dy, self.batch, self.outputs))]
         }
     }
-}
 
-impl Conv3x3 {
     /// The transformed filters `[panels][36][inputs in whole groups][32]`. `strides`: floats from one output to the
     /// next, and from one input to the next. `turned`: by 180°.
     fn transformed(&self, weight: &[f32], strides: [usize; 2], turned: bool) -> Floats {
@@ -93,8 +70,7 @@ impl Conv3x3 {
 
     /// Winograd's method with transformed filters. The result is 0 where `mask` is not positive, if there is a mask.
     fn run(&self, x: &[f32], filters: &[f32], bias: Option<&[f32]>, mask: Option<&[f32]>) -> Vec<f32> {
-        let Self { height, width, rectified, .. } = *self;
-        let plane = height * width;
+        let (Self { height, width, rectified, .. }, plane) = (*self, self.pixels());
         assert_eq!(x.len(), self.batch * self.inputs * plane);
         let mut padded = bias.unwrap_or_default().to_vec();
         padded.resize(self.outputs.next_multiple_of(GROUP), 0.0);

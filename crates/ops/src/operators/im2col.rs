@@ -4,7 +4,7 @@
 
 use rayon::prelude::*;
 
-use super::Layer;
+use super::Convolution;
 use super::elements::{add_constant, channel_sums, mask, rectify};
 use crate::buffers::{Floats, take};
 use crate::multiply::{Right, product};
@@ -19,34 +19,11 @@ const PIXELS: usize = 64;
 /// Channels per task in the backward pass.
 const CHANNELS: usize = 16;
 
-/// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
-#[derive(Debug, Clone, Copy)]
-pub struct Unfolded {
-    /// Images.
-    pub batch: usize,
-    /// Channels of the input.
-    pub inputs: usize,
-    /// Channels of the output.
-    pub outputs: usize,
-    /// Rows of the input.
-    pub height: usize,
-    /// Columns of the input.
-    pub width: usize,
-    /// Rows and columns of the input per row and column of the output.
-    pub stride: usize,
-    /// Reads max(x, 0).
-    pub rectified: bool,
-}
-
-impl Layer for Unfolded {
-    type Kept = ();
-
-    /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, 3, 3]`, `bias` `[outputs]` →
-    /// `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
-        let Self { inputs, outputs, .. } = *self;
+impl Convolution {
+    /// The result of a 3×3 convolution.
+    pub(super) fn unfolded(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
+        let (Self { inputs, outputs, .. }, plane) = (*self, self.pixels());
         let [rows, columns] = self.size();
-        let plane = self.height * self.width;
         let mut out = take(self.batch * outputs * rows * columns);
         let band = rows.div_ceil(BANDS).max(PIXELS.div_ceil(columns)).min(rows);
         let tasks: Vec<_> = out
@@ -69,15 +46,15 @@ impl Layer for Unfolded {
                 add_constant(results, bias.map_or(0.0, |bias| bias[c]), out);
             }
         });
-        (out, ())
+        out
     }
 
-    /// Gradients from the output's gradient `dy` `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
-    fn backward(&self, x: &[f32], weight: &[f32], (): (), dy: &[f32], wanted: [bool; 3]) -> InputGradients {
-        let [of_input, of_weight, of_bias] = wanted;
+    /// The gradients of a 3×3 convolution.
+    pub(super) fn unfolded_gradients(&self, given: [&[f32]; 3], wanted: [bool; 3]) -> InputGradients {
+        let ([x, weight, dy], [of_input, of_weight, of_bias]) = (given, wanted);
         let Self { batch, inputs, outputs, .. } = *self;
         let [rows, columns] = self.size();
-        let (plane, n) = (self.height * self.width, rows * columns);
+        let (plane, n) = (self.pixels(), rows * columns);
         let mut dx = of_input.then(|| take(x.len()));
         // Every task computes some input channels of all images.
         let slices: Vec<Vec<&mut [f32]>> = match &mut dx {
@@ -123,9 +100,7 @@ impl Layer for Unfolded {
         let bias = of_bias.then(|| channel_sums(dy, batch, outputs));
         [dx, weight, bias]
     }
-}
 
-impl Unfolded {
     /// Rows and columns of the output.
     fn size(&self) -> [usize; 2] {
         [self.height.div_ceil(self.stride), self.width.div_ceil(self.stride)]
@@ -134,7 +109,7 @@ impl Unfolded {
     /// Writes the inputs of the nine taps of every channel, `[channels, 9, rows, columns]`, for the output rows from
     /// `row` on.
     fn unfold(&self, x: &[f32], row: usize, taps: &mut [f32]) {
-        let (plane, [_, columns]) = (self.height * self.width, self.size());
+        let (plane, [_, columns]) = (self.pixels(), self.size());
         let mut positive = Floats::new(if self.rectified { x.len() } else { 0 });
         let x = if self.rectified {
             rectify(x, &mut positive);
@@ -167,7 +142,7 @@ impl Unfolded {
         let [rows, columns] = self.size();
         x.fill(0.0);
         for (i, taps) in taps.chunks_exact(rows * columns).enumerate() {
-            let (x, tap) = (&mut x[i / TAPS * self.height * self.width..], i % TAPS);
+            let (x, tap) = (&mut x[i / TAPS * self.pixels()..], i % TAPS);
             let (first, last, from) = self.columns(tap);
             for (y, taps) in taps.chunks_exact(columns).enumerate() {
                 let line = self.stride * y + tap / 3;

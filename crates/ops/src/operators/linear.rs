@@ -49,7 +49,7 @@ impl Layer for Linear {
     ) -> (Vec<f32>, Option<Floats>) {
         let (size, piece) = (self.rows * self.outputs, ROWS * self.outputs);
         let (mut out, mut before) = (take(size), (self.gelu && keep).then(|| Floats::new(size)));
-        let weight = self.factor(weight);
+        let weight = Right::new(self.in_bf16, [self.inputs, self.outputs], (weight, self.strides()));
         let kept = parts(before.as_deref_mut(), piece, self.rows.div_ceil(ROWS));
         let tasks = out.par_chunks_mut(piece).zip(x.par_chunks(ROWS * self.inputs));
         tasks.zip(kept).for_each(|((out, x), before)| match before {
@@ -73,15 +73,8 @@ impl Layer for Linear {
         (out, before)
     }
 
-    /// Gradients from the output's gradient `dy` `[rows, outputs]`.
-    fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        before: Option<Floats>,
-        dy: &[f32],
-        [of_input, of_weight, of_bias]: [bool; 3],
-    ) -> InputGradients {
+    fn backward(&self, given: [&[f32]; 3], before: Option<Floats>, wanted: [bool; 3]) -> InputGradients {
+        let ([x, weight, dy], [of_input, of_weight, of_bias]) = (given, wanted);
         assert_eq!(before.is_some(), self.gelu, "kept by the forward pass");
         let Self { rows, inputs, outputs, .. } = *self;
         let blocks = rows.div_ceil(ROWS);
@@ -136,11 +129,6 @@ impl Linear {
     /// (column, row) strides of the weight as `[inputs, outputs]`.
     fn strides(&self) -> [usize; 2] {
         if self.transposed { [self.inputs, 1] } else { [1, self.outputs] }
-    }
-
-    /// The weight as the right factor.
-    fn factor<'a>(&self, weight: &'a [f32]) -> Right<'a> {
-        Right::new(self.in_bf16, [self.inputs, self.outputs], (weight, self.strides()))
     }
 
     fn product(&self, x: &[f32], rhs: &Right, bias: Option<&[f32]>, out: &mut [f32]) {

@@ -8,6 +8,7 @@
 mod attention;
 mod conv1x1;
 mod conv3x3;
+mod convolution;
 mod elements;
 mod im2col;
 mod linear;
@@ -25,9 +26,7 @@ use rayon::prelude::*;
 use crate::op::InputGradients;
 
 pub use attention::Attention;
-pub use conv1x1::Conv1x1;
-pub use conv3x3::Conv3x3;
-pub use im2col::Unfolded;
+pub use convolution::Convolution;
 pub use linear::Linear;
 pub use norm::LayerNorm;
 
@@ -39,16 +38,9 @@ pub trait Layer: Debug + Send + Sync + 'static {
     /// `keep`: a backward pass will follow.
     fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept);
 
-    /// The wanted gradients of the input, the weight and the bias, from the result's gradient `dy`. Unwanted gradients
-    /// cost nothing.
-    fn backward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        kept: Self::Kept,
-        dy: &[f32],
-        wanted: [bool; 3],
-    ) -> InputGradients;
+    /// The wanted gradients of the input, the weight and the bias, from the input, the weight and the result's gradient.
+    /// Unwanted gradients cost nothing.
+    fn backward(&self, given: [&[f32]; 3], kept: Self::Kept, wanted: [bool; 3]) -> InputGradients;
 }
 
 /// The sum of parts of `len` values each, in the order of the parts.

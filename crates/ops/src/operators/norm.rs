@@ -44,14 +44,11 @@ impl Layer for LayerNorm {
         (out, statistics)
     }
 
-    /// Gradients from the output's gradient `dy` `[rows, channels]`. If the gradient of weight or bias is wanted, both
-    /// are computed.
+    /// If the gradient of weight or bias is wanted, both are computed.
     fn backward(
         &self,
-        x: &[f32],
-        weight: &[f32],
+        [x, weight, dy]: [&[f32]; 3],
         statistics: Vec<Statistics>,
-        dy: &[f32],
         [of_input, of_weight, of_bias]: [bool; 3],
     ) -> InputGradients {
         let (c, piece) = (self.channels, ROWS * self.channels);

@@ -88,14 +88,20 @@ fn convolutions_of_three_taps_equal_burns() {
     }
 }
 
+/// A 3×3 convolution with stride 1.
+fn convolution([batch, inputs, outputs, height, width]: [usize; 5]) -> Convolution {
+    let (side, stride, rectified, in_bf16) = (3, 1, false, false);
+    Convolution { batch, inputs, outputs, height, width, side, stride, rectified, in_bf16 }
+}
+
 #[test]
 fn taps_that_see_nothing_have_no_gradient() {
-    let conv = Conv3x3 { batch: 1, inputs: 1, outputs: 1, height: 32, width: 32, rectified: true };
+    let conv = Convolution { rectified: true, ..convolution([1, 1, 1, 32, 32]) };
     let mut x = vec![-1.0; 1024];
     x[0] = 0.7;
     let mut dy = vec![0.0; 1024];
     dy[0] = 0.3;
-    let [_, weight, _] = conv.backward(&x, &[0.1; 9], (), &dy, [true; 3]);
+    let [_, weight, _] = conv.backward([&x, &[0.1; 9], &dy], (), [true; 3]);
     let expected: Vec<f32> = (0..9).map(|tap| if tap == 4 { 0.7 * 0.3 } else { 0.0 }).collect();
     assert_eq!(weight, Some(expected));
 }
@@ -203,17 +209,18 @@ fn everything(in_bf16: bool) -> Vec<Vec<f32>> {
         let (result, kept) = layer.forward(x, weight, Some(bias), true);
         assert_eq!(layer.forward(x, weight, Some(bias), false).0, result);
         all.push(result);
-        all.extend(layer.backward(x, weight, kept, dy, [true; 3]).into_iter().flatten());
+        all.extend(layer.backward([x, weight, dy], kept, [true; 3]).into_iter().flatten());
     }
     let mut all = Vec::new();
     let (x, dy) = (random(2 * 40 * 30 * 50, 1), random(2 * 72 * 30 * 50, 2));
     let (weight, bias) = (random(72 * 40 * 9, 3), random(72, 4));
-    let [batch, inputs, outputs, height, width] = [2, 40, 72, 30, 50];
+    let (batch, outputs) = (2, 72);
     let given = [&x[..], &weight, &bias, &dy];
-    add(&mut all, &Conv3x3 { batch, inputs, outputs, height, width, rectified: true }, given);
-    let halving = Unfolded { batch, inputs, outputs, height, width, stride: 2, rectified: true };
+    let conv = Convolution { rectified: true, in_bf16, ..convolution([batch, 40, outputs, 30, 50]) };
+    add(&mut all, &conv, given);
+    let halving = Convolution { stride: 2, ..conv };
     add(&mut all, &halving, [&x, &weight, &bias, &dy[..2 * 72 * 15 * 25]]);
-    add(&mut all, &Conv1x1 { batch, inputs, outputs, pixels: 1500, rectified: true, in_bf16 }, given);
+    add(&mut all, &Convolution { side: 1, ..conv }, given);
     let linear = Linear { rows: 1500, inputs: 80, outputs, transposed: false, in_bf16, gelu: true };
     add(&mut all, &linear, given);
     let norm = LayerNorm { channels: 80, epsilon: 1e-6 };
@@ -242,12 +249,12 @@ fn the_number_of_threads_changes_no_bit() {
 
 #[test]
 fn only_wanted_gradients_are_found_and_they_are_the_same() {
-    let conv = Conv3x3 { batch: 1, inputs: 3, outputs: 5, height: 6, width: 7, rectified: false };
+    let conv = convolution([1, 3, 5, 6, 7]);
     let (x, weight, dy) = (random(3 * 42, 1), random(135, 2), random(5 * 42, 3));
-    let all = conv.backward(&x, &weight, (), &dy, [true; 3]);
+    let all = conv.backward([&x, &weight, &dy], (), [true; 3]);
     for bits in 0..8 {
         let wanted = [1, 2, 4].map(|bit| bits & bit > 0);
-        let got = conv.backward(&x, &weight, (), &dy, wanted);
+        let got = conv.backward([&x, &weight, &dy], (), wanted);
         assert_eq!(got[0], all[0].clone().filter(|_| wanted[0]));
         assert_eq!(got[1], all[1].clone().filter(|_| wanted[1]));
         assert_eq!(got[2].is_some(), wanted[2]);

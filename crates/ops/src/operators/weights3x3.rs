@@ -6,7 +6,7 @@
 use pulp::Arch;
 use rayon::prelude::*;
 
-use super::Conv3x3;
+use super::Convolution;
 use super::transposed::{Accumulate, OutputGradients, Taps};
 use crate::buffers::{Floats, take};
 use crate::winograd::GROUP;
@@ -20,7 +20,7 @@ const PART_TILES: usize = 96;
 /// Points per task, if there are fewer parts than cores.
 const TASK_POINTS: usize = 6;
 
-impl Conv3x3 {
+impl Convolution {
     /// Gradients of weight and bias.
     pub(super) fn weight_gradient(&self, x: &[f32], dy: &[f32]) -> [Vec<f32>; 2] {
         let [rows, columns] = [self.height, self.width].map(|side| side.div_ceil(TILE));
@@ -46,7 +46,7 @@ impl Conv3x3 {
     /// rows), and the sums of the output's gradient.
     fn part(&self, x: &[f32], dy: &[f32], blocks: &[(usize, usize, usize)]) -> (Floats, Vec<f64>) {
         let arch = Arch::new();
-        let (plane, columns) = (self.height * self.width, self.width.div_ceil(TILE));
+        let (plane, columns) = (self.pixels(), self.width.div_ceil(TILE));
         let [inputs, outputs] = [self.inputs, self.outputs].map(|n| n.next_multiple_of(GROUP));
         let part = columns.div_ceil(columns.div_ceil(self.block_tiles()));
         let stride = (self.band_rows() * part) | 1;

@@ -1,10 +1,9 @@
 //! The operators in order of execution, and where their parameters lie in one flat vector.
 
-use std::collections::HashMap;
 use std::ops::Range;
 
-use super::LEVELS;
-use crate::fused::GroupNorm;
+use super::{FEATURES, INPUT_CHANNELS, LEVELS};
+use crate::fused::{CHANNELS, GroupNorm};
 
 /// Where the parameters of a convolution lie.
 #[derive(Debug, Clone)]
@@ -50,20 +49,18 @@ pub struct Network {
     names: Vec<String>,
 }
 
-impl Network {
-    /// The network whose parameters have these `shapes`, by their names in a checkpoint.
-    ///
-    /// # Panics
-    /// If a parameter is missing.
-    pub fn new(shapes: &HashMap<String, Vec<usize>>) -> Self {
-        let mut places = Places { shapes, names: Vec::new(), end: 0, norms: 0 };
+impl Default for Network {
+    fn default() -> Self {
+        let mut places = Places::default();
         let steps = places.steps();
-        let norm_out = places.norm("norm_out");
-        let conv_out = places.conv("conv_out");
-        let gs_conv = places.conv("gs_conv");
+        let norm_out = places.norm("norm_out", CHANNELS);
+        let conv_out = places.conv("conv_out", [FEATURES, CHANNELS, 9]);
+        let gs_conv = places.conv("gs_conv", [FEATURES, FEATURES, 1]);
         Self { steps, norm_out, conv_out, gs_conv, names: places.names }
     }
+}
 
+impl Network {
     /// The names of all parameters, as in the authors' state dict, in the order of the flat vector.
     pub fn names(&self) -> &[String] {
         &self.names
@@ -94,77 +91,73 @@ impl Network {
 }
 
 /// Assigns consecutive places in the flat vector.
-struct Places<'a> {
-    shapes: &'a HashMap<String, Vec<usize>>,
+#[derive(Default)]
+struct Places {
     names: Vec<String>,
     /// Length of the flat vector so far.
     end: usize,
     norms: usize,
 }
 
-impl<'a> Places<'a> {
-    /// The place and the shape of a parameter.
-    fn place(&mut self, name: String) -> (Range<usize>, &'a [usize]) {
-        let shape = self.shapes.get(&name).unwrap_or_else(|| panic!("the network has no parameter {name}"));
-        let start = self.end;
-        self.end += shape.iter().product::<usize>();
+impl Places {
+    /// The place of a parameter of `len` values.
+    fn place(&mut self, name: String, len: usize) -> Range<usize> {
         self.names.push(name);
-        (start..self.end, shape.as_slice())
+        self.end += len;
+        self.end - len..self.end
     }
 
-    fn conv(&mut self, name: &str) -> Conv {
-        let (weight, shape) = self.place(format!("{name}.weight"));
-        let &[to, from, height, width] = shape else { panic!("{name} is no convolution") };
-        let (bias, _) = self.place(format!("{name}.bias"));
-        Conv { weight, bias, shape: [to, from, height * width] }
+    fn conv(&mut self, name: &str, shape: [usize; 3]) -> Conv {
+        let weight = self.place(format!("{name}.weight"), shape.iter().product());
+        Conv { weight, bias: self.place(format!("{name}.bias"), shape[0]), shape }
     }
 
-    fn norm(&mut self, name: &str) -> Norm {
-        let (gamma, _) = self.place(format!("{name}.weight"));
-        let (beta, _) = self.place(format!("{name}.bias"));
+    fn norm(&mut self, name: &str, channels: usize) -> Norm {
+        let [gamma, beta] = ["weight", "bias"].map(|part| self.place(format!("{name}.{part}"), channels));
         self.norms += 1;
         Norm { gamma, beta, index: self.norms - 1 }
     }
 
-    fn residual(&mut self, name: &str) -> Box<Residual> {
+    /// A block that reads `from` channels.
+    fn residual(&mut self, name: &str, from: usize) -> Box<Residual> {
         let shortcut = format!("{name}.shortcut");
         Box::new(Residual {
-            norm1: self.norm(&format!("{name}.norm1")),
-            conv1: self.conv(&format!("{name}.conv1")),
-            norm2: self.norm(&format!("{name}.norm2")),
-            conv2: self.conv(&format!("{name}.conv2")),
-            shortcut: self.shapes.contains_key(&format!("{shortcut}.weight")).then(|| self.conv(&shortcut)),
+            norm1: self.norm(&format!("{name}.norm1"), from),
+            conv1: self.conv(&format!("{name}.conv1"), [CHANNELS, from, 9]),
+            norm2: self.norm(&format!("{name}.norm2"), CHANNELS),
+            conv2: self.conv(&format!("{name}.conv2"), [CHANNELS, CHANNELS, 9]),
+            shortcut: (from != CHANNELS).then(|| self.conv(&shortcut, [CHANNELS, from, 1])),
         })
     }
 
     /// All operators in the order of the state dict.
     fn steps(&mut self) -> Vec<Step> {
-        let conv = self.conv("conv_in");
+        let conv = self.conv("conv_in", [CHANNELS, INPUT_CHANNELS, 9]);
         let mut steps = vec![Step::Convolve { conv, from: 0, stride: 1, enlarge: false }];
         let mut skips = vec![steps.len()];
         for level in 0..LEVELS {
             for i in 0..2 {
-                let block = self.residual(&format!("down_blocks.{level}.nets.{i}"));
+                let block = self.residual(&format!("down_blocks.{level}.nets.{i}"), CHANNELS);
                 steps.push(Step::Residual { block, from: steps.len(), skip: None });
                 skips.push(steps.len());
             }
             if level + 1 < LEVELS {
-                let conv = self.conv(&format!("down_blocks.{level}.downsample"));
+                let conv = self.conv(&format!("down_blocks.{level}.downsample"), [CHANNELS, CHANNELS, 9]);
                 steps.push(Step::Convolve { conv, from: steps.len(), stride: 2, enlarge: false });
                 skips.push(steps.len());
             }
         }
         for i in 0..2 {
-            let block = self.residual(&format!("mid_block.nets.{i}"));
+            let block = self.residual(&format!("mid_block.nets.{i}"), CHANNELS);
             steps.push(Step::Residual { block, from: steps.len(), skip: None });
         }
         for level in 0..LEVELS {
             for i in 0..3 {
-                let block = self.residual(&format!("up_blocks.{level}.nets.{i}"));
+                let block = self.residual(&format!("up_blocks.{level}.nets.{i}"), 2 * CHANNELS);
                 steps.push(Step::Residual { block, from: steps.len(), skip: skips.pop() });
             }
             if level + 1 < LEVELS {
-                let conv = self.conv(&format!("up_blocks.{level}.upsample"));
+                let conv = self.conv(&format!("up_blocks.{level}.upsample"), [CHANNELS, CHANNELS, 9]);
                 steps.push(Step::Convolve { conv, from: steps.len(), stride: 1, enlarge: true });
             }
         }

@@ -8,7 +8,7 @@ use pulp::{Arch, Scalar, Simd, WithSimd};
 use super::GROUP;
 use super::product::{Left, PANEL, Panels, Product};
 use crate::host;
-use crate::operators::{Conv3x3, Layer};
+use crate::operators::{Convolution, Layer};
 use crate::testing::{random, relative_error, values, wide};
 
 /// With the points of this crate the error is 1.5e-6, below the bound. With the points 0, ±1, ±2, ∞ it is 3.0e-6.
@@ -17,8 +17,9 @@ fn winograd_is_accurate() {
     let [channels, side] = [256, 16];
     let x = random([1, channels, side, side], 3);
     let (weight, bias) = (random([channels, channels, 3, 3], 1), random([channels], 2));
-    let (inputs, outputs, rectified) = (channels, channels, false);
-    let layer = Conv3x3 { batch: 1, inputs, outputs, height: side, width: side, rectified };
+    let (inputs, outputs, height, width) = (channels, channels, side, side);
+    let (stride, rectified, in_bf16) = (1, false, false);
+    let layer = Convolution { batch: 1, inputs, outputs, height, width, side: 3, stride, rectified, in_bf16 };
     let (got, ()) = layer.forward(&host(x.clone()), &host(weight.clone()), Some(&host(bias.clone())), false);
     let [x, weight] = [x, weight].map(|tensor| tensor.cast(FloatDType::F64));
     let options = ConvOptions::new([1, 1], [1, 1], [1, 1], 1);

@@ -104,20 +104,9 @@ impl GaussianTask {
     }
 
     /// Gaussians of all views, for validations.
-    fn whole(&self, networks: &Networks, item: &Stage2Item) -> Option<Gaussians> {
+    fn whole(&self, networks: &Networks, item: &Stage2Item) -> Gaussians {
         let prediction = self.predict(networks, item, false);
         gaussians(&self.config, networks, item, prediction, &Phase::new(false, 0), &self.inner)
-    }
-
-    /// Renders all target views `[V,3,h,w]`. Without Gaussians the pictures show the background.
-    fn shown(&self, item: &Stage2Item, gaussians: Option<Gaussians>) -> Result<Tensor<4>, TrainError> {
-        match gaussians {
-            Some(gaussians) => Ok(self.render(&gaussians, &item.target_cameras, item.background)?.0),
-            None => {
-                let color = Tensor::<1>::from_floats(item.background, &self.inner).reshape([1, 3, 1, 1]);
-                Ok(color.expand([item.target_cameras.len(), 3, item.target_side, item.target_side]))
-            }
-        }
     }
 
     /// Scores of the billboard baseline: both photographs as flat cut-outs in the plane through the person's axis. Its
@@ -141,12 +130,12 @@ impl GaussianTask {
             };
             let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
             let gaussians = gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), device);
-            Ok(sums.add(&item, self.shown(&item, gaussians)?)?)
+            Ok(sums.add(&item, self.render(&gaussians, &item.target_cameras, item.background)?.0)?)
         })?;
         Ok(*self.billboard_scores.get_or_init(|| Scores::mean(&all)))
     }
 
-    /// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`.
+    /// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`. Without Gaussians the pictures show the background.
     fn render(
         &self,
         gaussians: &Gaussians,
@@ -202,9 +191,11 @@ impl Task for GaussianTask {
                 let value = parts.into_iter().map(|part| part.value * part.weight);
                 add("points", config.points_weight, value.reduce(|a, b| a + b).expect("there are points"));
             }
-            let made = gaussians(&self.config, networks, item, prediction, &phase, device);
+            let gaussians = gaussians(&self.config, networks, item, prediction, &phase, device);
             // A sample without a valid pixel has no picture, and counts as one without an error.
-            let Some(gaussians) = made else { continue };
+            if gaussians.is_empty() {
+                continue;
+            }
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
             let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
@@ -229,7 +220,8 @@ impl Task for GaussianTask {
             return Ok(None);
         }
         let all = self.data.validated(ranks, |sums: &mut Scores, item| {
-            Ok(sums.add(&item, self.shown(&item, self.whole(networks, &item))?)?)
+            let gaussians = self.whole(networks, &item);
+            Ok(sums.add(&item, self.render(&gaussians, &item.target_cameras, item.background)?.0)?)
         })?;
         let [full, masked, sides, ssim] = Scores::mean(&all);
         let [_, billboard_masked, billboard_sides, _] = self.billboard(ranks)?;
@@ -257,10 +249,7 @@ impl Task for GaussianTask {
             let mut row = vec![photo(0), photo(1)];
             let views = [0, item.target_cameras.len() - 2];
             let cameras = views.map(|v| item.target_cameras[v]);
-            let seen = match self.whole(networks, &item) {
-                Some(gaussians) => host(self.render(&gaussians, &cameras, item.background)?.0),
-                None => vec![0.0; 2 * 3 * item.target_side.pow(2)],
-            };
+            let seen = host(self.render(&self.whole(networks, &item), &cameras, item.background)?.0);
             let (side, area) = (item.target_side, item.target_side.pow(2));
             for (place, view) in views.into_iter().enumerate() {
                 let at = |values: &[f32], view: usize, i: usize| {

@@ -46,7 +46,7 @@ impl Phase {
     }
 }
 
-/// Gaussians of a sample in the data set's world; `None` if no pixel is valid.
+/// Gaussians of a sample in the data set's world; none if no pixel is valid.
 pub(super) fn gaussians(
     config: &Config,
     networks: &Networks,
@@ -54,7 +54,7 @@ pub(super) fn gaussians(
     prediction: Prediction,
     phase: &Phase,
     device: &Device,
-) -> Option<Gaussians> {
+) -> Gaussians {
     // As in use.
     let has_backing = !config.mode.compat && prediction.maps.len() > 2;
     let mut points = Points::new(prediction.pasted(&config.network));
@@ -68,7 +68,7 @@ pub(super) fn gaussians(
     let Painted { mut gaussians, mut origins, .. } =
         painter.gaussians(&mut points, device, &mut Record::default());
     if gaussians.is_empty() {
-        return None;
+        return gaussians;
     }
     if has_backing && let Some((backing, more)) = backing(&gaussians, &origins, config) {
         gaussians = Gaussians::joined(&[gaussians, backing]);
@@ -79,7 +79,7 @@ pub(super) fn gaussians(
         Some(restoration) => restoration.person(gaussians, &origins),
         None => gaussians,
     };
-    Some(placed(config, person, &to_world))
+    placed(config, person, &to_world)
 }
 
 /// Target pictures `[V,3,h,w]` and masks `[V,h,w]` of the views with these indices.
