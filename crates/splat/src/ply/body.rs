@@ -24,7 +24,7 @@ impl Value<'_> {
     pub fn number(self) -> Option<f32> {
         match self {
             Self::Text(word) => word.parse().ok(),
-            Self::Binary(kind, bytes) => Some(kind.read(&bytes)),
+            Self::Binary(kind, bytes) => Some(kind.read(bytes) as f32),
         }
     }
 
@@ -32,7 +32,8 @@ impl Value<'_> {
     pub fn count(self) -> Option<usize> {
         match self {
             Self::Text(word) => word.parse().ok(),
-            Self::Binary(kind, bytes) => kind.read_count(&bytes[..kind.size()]),
+            Self::Binary(Scalar::F32 | Scalar::F64, _) => None,
+            Self::Binary(kind, bytes) => Some(kind.read(bytes)).filter(|n| *n >= 0.0).map(|n| n as usize),
         }
     }
 }
