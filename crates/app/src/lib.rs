@@ -39,8 +39,8 @@ pub use commands::convert::drawable;
 pub use failure::Failure;
 pub use model::{CameraArguments, ModelArguments, check_memory};
 
-/// The program's version.
-pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+/// The program's version, with commit and date where the sources were in a repository.
+pub const VERSION: &str = env!("SNAPSNAP_VERSION");
 
 /// Every operation allocates and frees large tensors. mimalloc keeps their pages, while the system allocator returns
 /// them to the kernel and causes page faults.
@@ -83,7 +83,7 @@ const FIRST_STEPS: &str = "First steps:
 #[derive(Parser)]
 #[command(
     name = "snapsnap",
-    version,
+    version = VERSION,
     about = "Two photographs of a person become a 3D Gaussian human.",
     after_help = FIRST_STEPS
 )]

@@ -2,6 +2,7 @@
 //! files are read.
 
 pub mod body;
+mod compressed;
 pub mod header;
 mod read;
 

@@ -28,6 +28,14 @@ impl Value<'_> {
         }
     }
 
+    /// As [`Self::number`], with all digits of integers.
+    pub(super) fn exact(self) -> Option<f64> {
+        match self {
+            Self::Text(word) => word.parse().ok(),
+            Self::Binary(kind, bytes) => Some(kind.read(bytes)),
+        }
+    }
+
     /// The value as a length or an index. `None` for floats and negative numbers.
     pub fn count(self) -> Option<usize> {
         match self {

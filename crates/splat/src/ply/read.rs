@@ -3,9 +3,10 @@
 
 use std::io::{BufRead, BufReader, Cursor, Read};
 
-use super::Y_DOWN;
 use super::body::Body;
-use super::header::{Header, MAX_HEADER, parse};
+use super::{Y_DOWN, compressed};
+use super::header::{Header, MAX_HEADER, Scalar, parse};
+use crate::sh;
 use crate::stored::{COEFFICIENTS, Problem, Stored};
 use snapsnap_base::quoted;
 
@@ -15,7 +16,9 @@ pub(crate) fn read(mut input: impl Read) -> Result<Stored, Problem> {
     (&mut input).take(MAX_HEADER as u64 + 1).read_to_end(&mut start)?;
     let header = parse(&start)?;
     let body = BufReader::new(Cursor::new(start.split_off(header.len)).chain(input));
-    let mut stored = table(&header, Body::new(body, header.format))?;
+    let body = Body::new(body, header.format);
+    let is_compressed = compressed::is_compressed(&header);
+    let mut stored = if is_compressed { compressed::read(&header, body) } else { table(&header, body) }?;
     if header.comments.iter().any(|comment| comment == Y_DOWN) {
         stored.turn(true);
     }
@@ -35,7 +38,15 @@ fn table(header: &Header, mut body: Body<impl BufRead>) -> Result<Stored, Proble
     }
     let position = |name: &str| vertex.properties.iter().position(|p| p.name == name);
     let mut wanted = Vec::new();
+    // Other programs write colours of points.
+    let is_colored = position("f_dc_0").is_none() && position("red").is_some();
     for name in Stored::COLUMNS {
+        let name = match name {
+            "f_dc_0" if is_colored => "red",
+            "f_dc_1" if is_colored => "green",
+            "f_dc_2" if is_colored => "blue",
+            name => name,
+        };
         wanted.push(position(name).ok_or_else(|| {
             let found: Vec<String> = vertex.properties.iter().map(|p| quoted(&p.name)).take(12).collect();
             format!(
@@ -64,6 +75,10 @@ fn table(header: &Header, mut body: Body<impl BufRead>) -> Result<Stored, Proble
             }
             Some(())
         })?;
+    }
+    if is_colored {
+        let white = if vertex.properties[wanted[11]].kind == Scalar::U8 { 255.0 } else { 1.0 };
+        columns[11..14].iter_mut().flatten().for_each(|value| *value = (*value / white - 0.5) / sh::C0);
     }
     Ok(Stored { coefficients, columns })
 }
