@@ -1,6 +1,6 @@
 //! Time per synthetic person: `cargo bench --workspace --bench people -- [MAKEHUMAN_DATA]`.
 //!
-//! The time includes building or morphing, posing, dressing, meshing and painting. The bench `view` measures drawing.
+//! The time includes building or morphing, posing, dressing, meshing and painting.
 
 use std::path::Path;
 use std::time::Instant;
