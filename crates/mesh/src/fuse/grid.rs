@@ -328,17 +328,6 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_ball_is_closed_and_has_its_volume() {
-        let (positions, faces) = grid(41, |p| p.length() - 0.7).surface();
-        assert!(is_closed(&faces));
-        let expected = 4.0 / 3.0 * std::f64::consts::PI * 0.7_f64.powi(3);
-        let found = volume(&positions, &faces);
-        assert!((found / expected - 1.0).abs() < 0.01, "{found} instead of {expected}");
-        // One piece without handles.
-        assert_eq!(positions.len() as i64 - faces.len() as i64 * 3 / 2 + faces.len() as i64, 2);
-    }
-
-    #[test]
     fn noise_is_closed_and_one_piece_once_one_body_is_kept() {
         let noise = |p: Vec3| (p * 977.0).dot(Vec3::new(12.9898, 78.233, 37.719)).sin();
         // Small pieces inside, then small pieces outside.
