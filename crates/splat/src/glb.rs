@@ -130,17 +130,17 @@ pub(crate) fn write(stored: &Stored, out: &mut impl Write) -> io::Result<()> {
         }
     }
     for i in 0..n {
-        let color = |channel: usize| linear(0.5 + sh::C0 * stored.band(0, channel)[i]);
+        let color = |channel: usize| linear_light(0.5 + sh::C0 * stored.band(0, channel)[i]);
         let color = [color(0), color(1), color(2), opacity(stored.columns[10][i])];
         out.write_all(&color.map(|value| (255.0 * value).round() as u8))?;
     }
     Ok(())
 }
 
-/// From sRGB to linear light (IEC 61966-2-1).
-fn linear(value: f32) -> f32 {
-    let value = value.clamp(0.0, 1.0);
-    if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+/// Linear light of an sRGB value, which is clamped to [0, 1] (IEC 61966-2-1).
+pub fn linear_light(shown: f32) -> f32 {
+    let shown = shown.clamp(0.0, 1.0);
+    if shown <= 0.04045 { shown / 12.92 } else { ((shown + 0.055) / 1.055).powf(2.4) }
 }
 
 /// Reads a file of `length` bytes: its only primitive with the extension, with float attributes and unmoved nodes.

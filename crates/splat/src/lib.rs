@@ -22,6 +22,7 @@ mod stored;
 pub use camera::{Camera, Orbit, RigidTransform};
 pub use error::SplatError;
 pub use gaussians::{Gaussians, affine};
+pub use glb::linear_light;
 pub use op::Counts;
 pub use options::{MAX_SIDE, MIN_ALPHA, MIN_TRANSMITTANCE, Preset, RenderOptions, TILE};
 pub use render::{Rendered, render};

@@ -9,6 +9,7 @@ use gltf::binary::{Glb, Header};
 use serde_json::{Value, json};
 use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
+use snapsnap_splat::linear_light;
 
 use super::png;
 use crate::mesh::{Face, Mesh, bounds};
@@ -50,7 +51,7 @@ pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
     if !mesh.colors.is_empty() {
         // Colours are linear in glTF, for which 8 bits do not suffice. A vertex takes a multiple of 4 bytes.
         let color = |(p, _): &Vertex| {
-            let [r, g, b] = mesh.colors[*p as usize].to_array().map(linear);
+            let [r, g, b] = mesh.colors[*p as usize].to_array().map(linear_light);
             [r, g, b, 1.0].map(|c| (c * f32::from(u16::MAX)).round() as u16)
         };
         let colors = file.view(rows.iter().flat_map(color).flat_map(u16::to_le_bytes), Some(ATTRIBUTES));
@@ -71,7 +72,7 @@ pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
             .filter(|(face, _)| face.material as usize == row)
             .flat_map(|(_, corners)| *corners)
             .collect();
-        let [r, g, b] = material.color.to_array().map(linear);
+        let [r, g, b] = material.color.to_array().map(linear_light);
         let mut surface =
             json!({ "baseColorFactor": [r, g, b, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0 });
         if let Some(texture) = &material.texture {
@@ -176,10 +177,4 @@ impl Content {
         let file = Glb { header, json: json.into(), bin: Some(self.bytes.into()) };
         file.to_vec().map_err(io::Error::other)
     }
-}
-
-/// Linear light of an sRGB value.
-fn linear(shown: f32) -> f32 {
-    let shown = shown.clamp(0.0, 1.0);
-    if shown <= 0.040_45 { shown / 12.92 } else { ((shown + 0.055) / 1.055).powf(2.4) }
 }
