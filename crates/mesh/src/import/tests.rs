@@ -172,6 +172,11 @@ fn glb(change: impl FnOnce(String) -> String) -> Vec<u8> {
     gltf::Glb { header, json: json.into(), bin: Some(binary.into()) }.to_vec().expect("writes")
 }
 
+/// The GLB with `from` in its JSON replaced once.
+fn changed(from: &str, to: &str) -> Vec<u8> {
+    glb(|json| json.replacen(from, to, 1))
+}
+
 #[test]
 fn glb_with_nested_nodes_and_a_texture() {
     let folder = Folder::new();
@@ -180,7 +185,7 @@ fn glb_with_nested_nodes_and_a_texture() {
     // glTF counts texture rows from the top: (0, 1), (1, 1), (0, 0) are our (0, 0), (1, 0), (0, 1).
     assert_eq!(texcoords(&mesh, 0), Some([Vec2::ZERO, Vec2::X, Vec2::Y]));
     assert!(mesh.materials[mesh.faces[0].material as usize].texture.is_some());
-    let mirrored = glb(|json| json.replace("\"translation\":[0,0,4]", "\"scale\":[-1,1,1]"));
+    let mirrored = changed("\"translation\":[0,0,4]", "\"scale\":[-1,1,1]");
     let mesh = read(&folder.file("b.glb", mirrored)).expect("reads");
     assert!(
         mesh.normals()[0].z > 0.9,
@@ -209,10 +214,7 @@ fn corrupt_scans_are_refused_by_name() {
     let triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
     let binary = ply("binary_little_endian");
     let bare = r#"{"asset":{"version":"2.0"},"meshes":[{"primitives":[{"attributes":{"POSITION":0}}]}]}"#;
-    let image = |image: &str| {
-        let image = format!("\"images\":[{image}]");
-        glb(|json| json.replace(r#""images":[{"bufferView":3,"mimeType":"image/png"}]"#, &image))
-    };
+    let image = |image: &str| changed(r#"{"bufferView":3,"mimeType":"image/png"}"#, image);
     let table: Vec<(&str, Vec<u8>, &str)> = vec![
         ("truncated.obj", b"v 0 0 0\nv 1 0 0\nv 0 1".into(), "line 3, `v 0 1`: no position"),
         ("huge.obj", triangle.replace("1 0 0", "1 1e39 0").into(), "position 1 is not finite"),
@@ -232,31 +234,15 @@ fn corrupt_scans_are_refused_by_name() {
         ),
         ("cut.glb", glb(|json| json)[..600].into(), "is no valid GLB"),
         ("text.glb", b"not a GLB".into(), "is no valid GLB"),
-        (
-            "accessor.glb",
-            glb(|json| json.replacen("\"count\":3", "\"count\":1000000000", 1)),
-            "promises 1000000000 entries",
-        ),
-        ("zero.glb", glb(|json| json.replacen("\"count\":3", "\"count\":0", 1)), "accessor 0"),
-        ("indices.glb", glb(|json| json.replace("5123", "5126")), "accessor 2"),
-        ("loop.glb", glb(|json| json.replace("\"mesh\":0,", "\"mesh\":0,\"children\":[0],")), "loop"),
-        (
-            "picture.glb",
-            glb(|json| json.replace("\"bufferView\":3", "\"bufferView\":0")),
-            "not a readable image",
-        ),
+        ("accessor.glb", changed("\"count\":3", "\"count\":1000000000"), "promises 1000000000 entries"),
+        ("zero.glb", changed("\"count\":3", "\"count\":0"), "accessor 0"),
+        ("indices.glb", changed("5123", "5126"), "accessor 2"),
+        ("loop.glb", changed("\"mesh\":0,", "\"mesh\":0,\"children\":[0],"), "loop"),
+        ("picture.glb", changed("\"bufferView\":3", "\"bufferView\":0"), "not a readable image"),
         // The parser panics on these documents.
         ("bare.glb", bare.into(), "is no valid GLB: mesh 0 refers to accessor 0, there are 0"),
-        (
-            "index.glb",
-            glb(|json| json.replace("\"indices\":2", "\"indices\":9")),
-            "is no valid GLB: mesh 0 refers to accessor 9",
-        ),
-        (
-            "source.glb",
-            image("{}"),
-            "is no valid GLB: image 0 has neither `uri` nor `bufferView` and `mimeType`",
-        ),
+        ("index.glb", changed("\"indices\":2", "\"indices\":9"), "is no valid GLB: mesh 0 refers to accessor 9"),
+        ("source.glb", image("{}"), "is no valid GLB: image 0 has neither `uri` nor `bufferView` and `mimeType`"),
         ("type.glb", image(r#"{"bufferView":3}"#), "is no valid GLB: image 0 has neither"),
         ("scan.stl", b"solid".into(), "expected a file .obj, .ply or .glb"),
     ];

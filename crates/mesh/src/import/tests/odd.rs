@@ -145,15 +145,12 @@ fn colours_of_faces_become_materials() {
 
 /// The triangle of [`glb`] with another material, texture and further keys.
 fn with(material: &str, texture: &str, keys: &str) -> Vec<u8> {
-    glb(|json| {
-        json.replace(r#""materials":[{"pbrMetallicRoughness":{"baseColorTexture":{"index":0}}}]"#, material)
-            .replace(r#""textures":[{"source":0}]"#, texture)
-            .replacen('{', &format!("{{{keys}"), 1)
-    })
+    glb(|json| json.replace(PLAIN, material).replace(SOURCE, texture).replacen('{', &format!("{{{keys}"), 1))
 }
 
 const PLAIN: &str = r#""materials":[{"pbrMetallicRoughness":{"baseColorTexture":{"index":0}}}]"#;
 const SOURCE: &str = r#""textures":[{"source":0}]"#;
+const PICTURE: &str = r#"{"bufferView":3,"mimeType":"image/png"}"#;
 
 #[test]
 fn glbs_of_every_writer_are_read() {
@@ -188,9 +185,7 @@ fn glbs_of_every_writer_are_read() {
     assert!(material(&mesh(with(PLAIN, webp, &required("EXT_texture_webp")))).texture.is_some());
     // A picture as text, and zeros after the JSON.
     let text = format!("data:image/png;base64,{}", BASE64_STANDARD.encode(png()));
-    let in_text = glb(|json| {
-        json.replace(r#"{"bufferView":3,"mimeType":"image/png"}"#, &format!(r#"{{"uri":"{text}"}}"#))
-    });
+    let in_text = changed(PICTURE, &format!(r#"{{"uri":"{text}"}}"#));
     assert!(material(&mesh(in_text)).texture.is_some());
     assert_eq!(mesh(glb(|json| json + "\0\0\0")).faces.len(), 1);
     // Positions as shares of the largest number, which the node enlarges.
@@ -219,15 +214,9 @@ fn glbs_of_every_writer_are_read() {
             with(PLAIN, r#""textures":[{"extensions":{"EXT_texture_webp":{"source":7}}}]"#, ""),
             "texture 0 has no picture",
         ),
-        (glb(|json| json.replace(r#","TEXCOORD_0":1"#, "")), "has a texture, but no `TEXCOORD_0`"),
-        (
-            glb(|json| json.replace(r#"{"bufferView":3,"mimeType":"image/png"}"#, r#"{"uri":"a.png"}"#)),
-            "picture 0 is another file, a.png",
-        ),
-        (
-            glb(|json| json.replace("\"buffers\":[{", "\"buffers\":[{\"uri\":\"a.bin\",")),
-            "its data is another file, a.bin",
-        ),
+        (changed(r#","TEXCOORD_0":1"#, ""), "has a texture, but no `TEXCOORD_0`"),
+        (changed(PICTURE, r#"{"uri":"a.png"}"#), "picture 0 is another file, a.png"),
+        (changed("\"buffers\":[{", "\"buffers\":[{\"uri\":\"a.bin\","), "its data is another file, a.bin"),
     ] {
         let error = read(&folder.file("b.glb", bytes)).map(|_| ()).expect_err(expected).to_string();
         assert!(error.contains(expected), "{error}");
@@ -246,8 +235,7 @@ fn surfaces_are_cut_out_where_their_texture_has_no_opacity() {
         format!(r#"{{"uri":"data:image/png;base64,{}"}}"#, BASE64_STANDARD.encode(picture.into_inner()));
     let coverage = |mode: &str| {
         let bytes = glb(|json| {
-            json.replace(r#"{"bufferView":3,"mimeType":"image/png"}"#, &uri)
-                .replace(r#""materials":[{"#, &format!(r#""materials":[{{{mode}"#))
+            json.replace(PICTURE, &uri).replace(r#""materials":[{"#, &format!(r#""materials":[{{{mode}"#))
         });
         let mesh = read(&folder.file("a.glb", bytes)).expect("reads");
         // Above (½, ½, 7), looking down at the triangle.
