@@ -82,15 +82,13 @@ impl Buffers {
 
     fn fill(&self, tensor: &CubeTensor, value: u32) {
         let n = tensor.meta.num_elements();
-        fill::launch(
-            &self.client,
-            self.cubes(n.div_ceil(256)),
-            CubeDim::new_1d(256),
-            tensor.clone().into_buffer_arg(),
-            n,
-            value,
-        );
+        fill::launch(&self.client, self.cubes(n.div_ceil(256)), CubeDim::new_1d(256), arg(tensor), n, value);
     }
+}
+
+/// The argument of a kernel for a buffer that is used again.
+pub fn arg(tensor: &CubeTensor) -> BufferArg {
+    tensor.clone().into_buffer_arg()
 }
 
 #[cube(launch)]

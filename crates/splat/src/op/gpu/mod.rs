@@ -37,7 +37,7 @@ use super::splat::{FATES, SPLAT, UniformsLaunch};
 use super::{CHANNELS, Forward, SplatBackend, SplatInputs, SplatKernels, SplatOutput, splat_untracked};
 use crate::SplatError;
 use blend::TileListsLaunch;
-use buffers::Buffers;
+use buffers::{Buffers, arg};
 use project::{ParametersLaunch, REACH, STATISTICS};
 
 /// Units of a cube where each unit has work of its own.
@@ -70,8 +70,7 @@ struct Lists {
 
 impl Lists {
     fn launch(&self) -> TileListsLaunch {
-        let buffer = |tensor: &CubeTensor| tensor.clone().into_buffer_arg();
-        TileListsLaunch::new(buffer(&self.entries), buffer(&self.starts), buffer(&self.ends))
+        TileListsLaunch::new(arg(&self.entries), arg(&self.starts), arg(&self.ends))
     }
 }
 
@@ -100,12 +99,12 @@ impl SplatKernels for CubeBackend {
             &buffers.client,
             buffers.cubes(all_tiles),
             CubeDim::new_1d(blend::UNITS as u32),
-            splats.clone().into_buffer_arg(),
-            scene.inputs.colors.clone().into_buffer_arg(),
+            arg(&splats),
+            arg(&scene.inputs.colors),
             lists.launch(),
-            image.clone().into_buffer_arg(),
-            transmittance.clone().into_buffer_arg(),
-            last.clone().into_buffer_arg(),
+            arg(&image),
+            arg(&transmittance),
+            arg(&last),
             scene.uniforms(job),
             job.options.depth,
             keep,
@@ -134,14 +133,14 @@ impl SplatKernels for CubeBackend {
                 &buffers.client,
                 buffers.cubes(all_tiles),
                 CubeDim::new_1d(blend::UNITS as u32),
-                state.splats.clone().into_buffer_arg(),
-                scene.inputs.colors.clone().into_buffer_arg(),
+                arg(&state.splats),
+                arg(&scene.inputs.colors),
                 state.lists.launch(),
-                state.lists.slots.clone().into_buffer_arg(),
-                state.transmittance.clone().into_buffer_arg(),
-                state.last.clone().into_buffer_arg(),
+                arg(&state.lists.slots),
+                arg(&state.transmittance),
+                arg(&state.last),
                 upstream.into_buffer_arg(),
-                records.clone().into_buffer_arg(),
+                arg(&records),
                 scene.uniforms(job),
                 job.options.depth,
                 record,
@@ -154,8 +153,8 @@ impl SplatKernels for CubeBackend {
                 buffers.cubes(scene.len.div_ceil(UNITS as usize)),
                 CubeDim::new_1d(UNITS),
                 scene.parameters(),
-                state.views.clone().into_buffer_arg(),
-                state.reach.clone().into_buffer_arg(),
+                arg(&state.views),
+                arg(&state.reach),
                 records.into_buffer_arg(),
                 unused(&gradients.means),
                 unused(&gradients.rotations),
@@ -211,9 +210,8 @@ impl Scene {
     }
 
     fn parameters(&self) -> ParametersLaunch {
-        let buffer = |tensor: &CubeTensor| tensor.clone().into_buffer_arg();
         let Inputs { means, rotations, scales, opacities, .. } = &self.inputs;
-        ParametersLaunch::new(buffer(means), buffer(rotations), buffer(scales), buffer(opacities))
+        ParametersLaunch::new(arg(means), arg(rotations), arg(scales), arg(opacities))
     }
 
     fn uniforms(&self, job: &Job) -> UniformsLaunch {
@@ -234,7 +232,7 @@ fn lists(
     let (n, tiles) = (scene.len, job.tiles_x() * job.tiles_y());
     let total = n * job.views.len();
     let all_tiles = tiles * job.views.len();
-    let dim = CubeDim::new_1d(UNITS);
+    let (client, dim) = (&buffers.client, CubeDim::new_1d(UNITS));
     let one_each = |n: usize| buffers.cubes(n.div_ceil(UNITS as usize));
     // The largest array has one record of the backward pass, or one number, per intersection.
     let numbers = if keep { RECORD } else { 1 };
@@ -253,30 +251,22 @@ fn lists(
         return Ok((splats, reach, lists, Counts::default()));
     }
     project::project_all::launch(
-        &buffers.client,
+        client,
         one_each(total),
         dim,
         scene.parameters(),
-        scene.inputs.colors.clone().into_buffer_arg(),
-        views.clone().into_buffer_arg(),
-        splats.clone().into_buffer_arg(),
-        reach.clone().into_buffer_arg(),
-        keys.clone().into_buffer_arg(),
-        statistics.clone().into_buffer_arg(),
+        arg(&scene.inputs.colors),
+        arg(views),
+        arg(&splats),
+        arg(&reach),
+        arg(&keys),
+        arg(&statistics),
         scene.uniforms(job),
         job.options.antialiased,
     );
     let (_, order) = sort::sort(buffers, keys, total, u32::BITS);
     let sorted = buffers.u32(total);
-    project::sort_counts::launch(
-        &buffers.client,
-        one_each(total),
-        dim,
-        reach.clone().into_buffer_arg(),
-        order.clone().into_buffer_arg(),
-        sorted.clone().into_buffer_arg(),
-        total,
-    );
+    project::sort_counts::launch(client, one_each(total), dim, arg(&reach), arg(&order), arg(&sorted), total);
     let offsets = scan::exclusive_sum(buffers, &sorted, total);
     let s: Vec<u32> = into_data_sync(statistics).try_into_vec().expect("u32 as allocated");
     let [low, middle, high] = [0, 1, 2].map(|limb| u64::from(s[FATES + limb]));
@@ -295,29 +285,29 @@ fn lists(
         return Ok((splats, reach, lists, counts));
     }
     project::emit::launch(
-        &buffers.client,
+        client,
         one_each(total),
         dim,
-        splats.clone().into_buffer_arg(),
+        arg(&splats),
         order.into_buffer_arg(),
         offsets.into_buffer_arg(),
-        reach.clone().into_buffer_arg(),
-        tile_of.clone().into_buffer_arg(),
-        splat_of.clone().into_buffer_arg(),
+        arg(&reach),
+        arg(&tile_of),
+        arg(&splat_of),
         scene.uniforms(job),
     );
     let bits = usize::BITS - all_tiles.leading_zeros();
     let (sorted_tiles, slots) = sort::sort(buffers, tile_of, len, bits);
     project::lists::launch(
-        &buffers.client,
+        client,
         one_each(len),
         dim,
         sorted_tiles.into_buffer_arg(),
-        slots.clone().into_buffer_arg(),
+        arg(&slots),
         splat_of.into_buffer_arg(),
-        entries.clone().into_buffer_arg(),
-        starts.clone().into_buffer_arg(),
-        ends.clone().into_buffer_arg(),
+        arg(&entries),
+        arg(&starts),
+        arg(&ends),
         len,
     );
     Ok((splats, reach, Lists { entries, slots, starts, ends, len }, counts))

@@ -2,7 +2,7 @@
 
 use cubecl::prelude::*;
 
-use super::buffers::Buffers;
+use super::buffers::{Buffers, arg};
 use burn_cubecl::tensor::CubeTensor;
 
 /// Units of a cube.
@@ -17,27 +17,12 @@ pub fn exclusive_sum(buffers: &Buffers, input: &CubeTensor, n: usize) -> CubeTen
     let blocks = (n + 1).div_ceil(BLOCK);
     let output = buffers.u32(n + 1);
     let sums = buffers.u32(blocks);
-    scan_blocks::launch(
-        &buffers.client,
-        buffers.cubes(blocks),
-        CubeDim::new_1d(UNITS as u32),
-        input.clone().into_buffer_arg(),
-        output.clone().into_buffer_arg(),
-        sums.clone().into_buffer_arg(),
-        n,
-        blocks,
-    );
+    let dim = CubeDim::new_1d(UNITS as u32);
+    let cubes = || buffers.cubes(blocks);
+    scan_blocks::launch(&buffers.client, cubes(), dim, arg(input), arg(&output), arg(&sums), n, blocks);
     if blocks > 1 {
         let before = exclusive_sum(buffers, &sums, blocks);
-        add_blocks::launch(
-            &buffers.client,
-            buffers.cubes(blocks),
-            CubeDim::new_1d(UNITS as u32),
-            before.into_buffer_arg(),
-            output.clone().into_buffer_arg(),
-            n,
-            blocks,
-        );
+        add_blocks::launch(&buffers.client, cubes(), dim, before.into_buffer_arg(), arg(&output), n, blocks);
     }
     output
 }

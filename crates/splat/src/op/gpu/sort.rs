@@ -2,7 +2,7 @@
 
 use cubecl::prelude::*;
 
-use super::buffers::Buffers;
+use super::buffers::{Buffers, arg};
 use super::scan::exclusive_sum;
 use burn_cubecl::tensor::CubeTensor;
 
@@ -21,34 +21,25 @@ const SHARE: usize = COUNTERS / UNITS;
 pub fn sort(buffers: &Buffers, keys: CubeTensor, n: usize, bits: u32) -> (CubeTensor, CubeTensor) {
     let blocks = n.div_ceil(BLOCK).max(1);
     let dim = CubeDim::new_1d(UNITS as u32);
+    let cubes = || buffers.cubes(blocks);
     let mut pairs = (keys.clone(), keys);
     let mut shift = 0;
     // At least one pass, since the first pass makes the positions.
     while shift == 0 || shift < bits {
         let counts = buffers.u32(DIGITS * blocks);
         let mask = (1 << (bits - shift).min(BITS)) - 1;
-        histogram::launch(
-            &buffers.client,
-            buffers.cubes(blocks),
-            dim,
-            pairs.0.clone().into_buffer_arg(),
-            counts.clone().into_buffer_arg(),
-            n,
-            blocks,
-            shift,
-            mask,
-        );
+        histogram::launch(&buffers.client, cubes(), dim, arg(&pairs.0), arg(&counts), n, blocks, shift, mask);
         let offsets = exclusive_sum(buffers, &counts, DIGITS * blocks);
         let sorted = (buffers.u32(n.max(1)), buffers.u32(n.max(1)));
         scatter::launch(
             &buffers.client,
-            buffers.cubes(blocks),
+            cubes(),
             dim,
             pairs.0.into_buffer_arg(),
             pairs.1.into_buffer_arg(),
             offsets.into_buffer_arg(),
-            sorted.0.clone().into_buffer_arg(),
-            sorted.1.clone().into_buffer_arg(),
+            arg(&sorted.0),
+            arg(&sorted.1),
             n,
             blocks,
             shift,
