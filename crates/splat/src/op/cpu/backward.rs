@@ -7,11 +7,11 @@ use super::super::gradient::{Record, SplatGradient};
 use super::super::inputs::{Inputs, Upstream, Wanted};
 use super::super::job::Job;
 use super::lanes::{BATCH, Lanes, fetch, row, rows};
-use super::splats::{Visible, projection};
+use super::splats::Visible;
 use super::{Scene, State, ViewState};
 use crate::linear::Vec3;
 use crate::options::{MIN_ALPHA, TILE};
-use crate::projection::{FootprintGradient, project_vjp};
+use crate::projection::{FootprintGradient, project, project_vjp, to_camera};
 
 /// Gaussians per task.
 const CHUNK: usize = 2048;
@@ -299,7 +299,8 @@ fn gather(
                 let gaussian = scene.gaussian(splat.gaussian as usize);
                 let v_compensation =
                     if job.options.antialiased { sums.opacity * gaussian.opacity } else { 0.0 };
-                let p = projection(&gaussian, camera, job);
+                let t = to_camera(camera, &gaussian.mean);
+                let p = project(camera, &t, &gaussian.rotation, &gaussian.scale, job.options.blur);
                 let v = project_vjp(camera, &p, &gaussian.scale, &sums.footprint, v_compensation);
                 add(out.means, i, [v.mean.x, v.mean.y, v.mean.z]);
                 add(out.rotations, i, [v.rotation.w, v.rotation.x, v.rotation.y, v.rotation.z]);

@@ -3,10 +3,10 @@
 use rayon::prelude::*;
 
 use super::super::job::Job;
-use super::super::splat::{Extent, FATES, Gaussian, Projected, Splat, VISIBLE, splat};
+use super::super::splat::{Extent, FATES, Projected, Splat, VISIBLE, splat};
 use super::Scene;
 use crate::linear::load3;
-use crate::projection::{Projection, View, project, to_camera};
+use crate::projection::View;
 
 /// Gaussians per task.
 const CHUNK: usize = 4096;
@@ -66,9 +66,4 @@ pub fn visible(scene: Scene, view: &View, job: &Job, fates: &mut [u64; FATES]) -
         chunks[position / CHUNK].0[position % CHUNK]
     };
     order.par_iter().map(at).collect()
-}
-
-/// Projection of a Gaussian that [`visible`] accepted.
-pub fn projection(gaussian: &Gaussian, view: &View, job: &Job) -> Projection {
-    project(view, &to_camera(view, &gaussian.mean), &gaussian.rotation, &gaussian.scale, job.options.blur)
 }
