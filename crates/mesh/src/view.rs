@@ -156,7 +156,7 @@ impl<'a> Renderer<'a> {
             Light::Plain(lights) => Lit::Plain(lights),
             Light::Around(surroundings) => Lit::Vertices(self.occlusion().light(surroundings, &self.normals)),
         };
-        let shader = Shader { renderer: self, camera, corners: &corners, light };
+        let shader = Shader { renderer: self, camera, corners: &corners, light, triangles, places };
         let pixels = width * height;
         let mut view = View {
             width,
@@ -178,8 +178,8 @@ impl<'a> Renderer<'a> {
         let bands = lists.par_iter().enumerate().zip(outputs);
         bands.for_each(|((number, list), (color, alpha, depth, second))| {
             let rows = [number * BAND, height.min((number + 1) * BAND)];
-            let Some(band) = Band::new(list, &triangles, rows, &places, &shader) else { return };
-            for (pixel, seen) in band.nearest.chunks_exact(places.len()).enumerate() {
+            let Some(band) = Band::new(list, rows, &shader) else { return };
+            for (pixel, seen) in band.nearest.chunks_exact(shader.places.len()).enumerate() {
                 let (x, y) = (band.left + pixel % band.columns, pixel / band.columns);
                 let at = y * width + x;
                 let ((inverse_depth, centre), samples) = seen.split_last().expect("the centre");
@@ -187,10 +187,10 @@ impl<'a> Renderer<'a> {
                     depth[at] = (1.0 / inverse_depth) as f32;
                 }
                 let corner = DVec2::new(x as f64, (rows[0] + y) as f64);
-                (color[at], alpha[at]) = shade(samples, &places, corner, &triangles, &shader);
+                (color[at], alpha[at]) = shade(samples, corner, &shader);
             }
             if options.second {
-                band.second(list, &triangles, rows, width, &shader, second);
+                band.second(list, rows, width, &shader, second);
             }
         });
         view
@@ -263,13 +263,8 @@ struct Band {
 
 impl Band {
     /// Rasterises the triangles of `list` in the rows `rows[0]..rows[1]`; `None` if `list` is empty.
-    fn new(
-        list: &[u32],
-        triangles: &[Triangle],
-        rows: [usize; 2],
-        places: &[[i64; 2]],
-        shader: &Shader,
-    ) -> Option<Self> {
+    fn new(list: &[u32], rows: [usize; 2], shader: &Shader) -> Option<Self> {
+        let Shader { triangles, places, .. } = shader;
         let columns = || list.iter().map(|index| triangles[*index as usize].columns);
         let left = columns().map(|[first, _]| first).min()?;
         let columns = columns().map(|[_, last]| last).max()? + 1 - left;
@@ -288,21 +283,14 @@ impl Band {
     }
 
     /// Writes [`View::second`] of the band's rows to `to`, whose rows have `width` pixels.
-    fn second(
-        &self,
-        list: &[u32],
-        triangles: &[Triangle],
-        rows: [usize; 2],
-        width: usize,
-        shader: &Shader,
-        to: &mut [f32],
-    ) {
+    fn second(&self, list: &[u32], rows: [usize; 2], width: usize, shader: &Shader, to: &mut [f32]) {
         let per_pixel = self.nearest.len() / ((rows[1] - rows[0]) * self.columns);
         let centres = self.nearest.iter().skip(per_pixel - 1).step_by(per_pixel);
         // A step of depth peeling: 1/z of the nearest front or back faces behind `limits` (inverse depths).
         let behind = |limits: &[f64], is_front: bool| {
             let mut found = vec![0.0_f64; limits.len()];
-            for t in list.iter().map(|index| &triangles[*index as usize]).filter(|t| t.is_front == is_front) {
+            let triangles = list.iter().map(|index| &shader.triangles[*index as usize]);
+            for t in triangles.filter(|t| t.is_front == is_front) {
                 t.samples(rows, &[[SUBPIXELS / 2; 2]], shader, |x, y, _, inverse_depth| {
                     let pixel = (y - rows[0]) * self.columns + x - self.left;
                     // A limit of 0 means no surface.
@@ -362,13 +350,7 @@ impl Triangle {
 }
 
 /// Colour and coverage of one pixel from its samples; `corner` is the pixel's upper left corner.
-fn shade(
-    samples: &[(f64, u32)],
-    places: &[[i64; 2]],
-    corner: DVec2,
-    triangles: &[Triangle],
-    shader: &Shader,
-) -> ([f32; 3], f32) {
+fn shade(samples: &[(f64, u32)], corner: DVec2, shader: &Shader) -> ([f32; 3], f32) {
     let mut color = Vec3::ZERO;
     let mut covered = 0;
     for (i, &(_, index)) in samples.iter().enumerate() {
@@ -382,11 +364,11 @@ fn shade(
         }
         let mut middle = DVec2::ZERO;
         let mut weight = 0;
-        for (place, _) in places.iter().zip(samples).filter(|(_, sample)| sample.1 == index) {
+        for (place, _) in shader.places.iter().zip(samples).filter(|(_, sample)| sample.1 == index) {
             middle += DVec2::new(place[0] as f64, place[1] as f64);
             weight += 1;
         }
-        let t = &triangles[index as usize];
+        let t = &shader.triangles[index as usize];
         let at = corner + middle / (f64::from(weight) * SUBPIXELS as f64);
         color += weight as f32 * shader.color(t.face as usize, at, t.plane);
     }

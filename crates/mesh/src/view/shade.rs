@@ -6,8 +6,8 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 use image::RgbImage;
 use snapsnap_splat::Camera;
 
-use super::Renderer;
 use super::light::Lights;
+use super::{Renderer, Triangle};
 
 /// Step in pixels for the derivative of texture coordinates.
 const STEP: f64 = 0.01;
@@ -85,6 +85,10 @@ pub struct Shader<'a> {
     /// Positions in the camera's frame.
     pub corners: &'a [DVec3],
     pub light: Lit<'a>,
+    /// Visible triangles.
+    pub(super) triangles: Vec<Triangle>,
+    /// Places of a pixel's samples; the last one is the centre.
+    pub places: Vec<[i64; 2]>,
 }
 
 impl Shader<'_> {
