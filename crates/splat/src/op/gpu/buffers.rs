@@ -47,12 +47,11 @@ impl Buffers {
         tensor
     }
 
-    /// f32 numbers from the host.
-    pub fn upload(&self, values: &[f32]) -> CubeTensor {
-        let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_ne_bytes()).collect();
-        let handle = self.client.create_from_slice(&bytes);
-        let shape = Shape::new([values.len()]);
-        CubeTensor::new_contiguous(self.client.clone(), self.device.clone(), shape, handle, DType::F32)
+    /// Numbers of 32 bits from the host.
+    pub fn upload(&self, bytes: &[u8], dtype: DType) -> CubeTensor {
+        let handle = self.client.create_from_slice(bytes);
+        let shape = Shape::new([bytes.len() / 4]);
+        CubeTensor::new_contiguous(self.client.clone(), self.device.clone(), shape, handle, dtype)
     }
 
     /// At least `n` cubes, over two axes if one is too short. Kernels return where `CUBE_POS` is `n` or more.
@@ -136,12 +135,9 @@ pub mod testing {
         test(&Buffers { client: device.client(), device });
     }
 
-    /// u32 numbers from the host.
+    /// u32 numbers from the host, and one more: a buffer is not empty.
     pub fn upload(buffers: &Buffers, values: &[u32]) -> CubeTensor {
-        let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_ne_bytes()).chain([0; 4]).collect();
-        let handle = buffers.client.create_from_slice(&bytes);
-        let shape = Shape::new([values.len() + 1]);
-        CubeTensor::new_contiguous(buffers.client.clone(), buffers.device.clone(), shape, handle, DType::U32)
+        buffers.upload(bytemuck::cast_slice(&[values, &[0]].concat()), DType::U32)
     }
 
     /// u32 numbers to the host.

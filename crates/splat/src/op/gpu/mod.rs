@@ -86,7 +86,7 @@ impl SplatKernels for CubeBackend {
     fn forward(inputs: &Inputs<CubeTensor>, job: &Job, keep: bool) -> Forward<Self> {
         let buffers = Buffers::of(&inputs.means);
         let scene = Scene::of(inputs, &buffers);
-        let views = buffers.upload(bytemuck::cast_slice(&job.views));
+        let views = buffers.upload(bytemuck::cast_slice(&job.views), DType::F32);
         let (splats, reach, lists, counts) = lists(&buffers, &scene, &views, job, keep)?;
 
         let shape = [job.views.len(), job.height, job.width, job.channels()];
