@@ -115,14 +115,14 @@ fn unsuitable_files_and_arguments_are_refused_by_name() {
     case(b"solid cube", &["not a PLY"]);
     case(b"\x89PNG\r\n\x1a\n", &["not a PLY"]);
     case(&good[..30], &["end_header"]);
-    case(&good[..good.len() - 1], &["20 vertices", "ends too early"]);
-    case(&good[..header_end + 11], &["ends too early"]);
+    case(&good[..good.len() - 1], &["vertex 19 of 20: `rot_3` is missing; the file may be cut off"]);
+    case(&good[..header_end + 11], &["vertex 0 of 20: `x` is missing"]);
     let header = |from: &str, to: &str| {
         let mut bytes = text(&good[..header_end]).replace(from, to).into_bytes();
         bytes.extend(&good[header_end..]);
         bytes
     };
-    case(&header("vertex 20", "vertex 1000000000000"), &["1000000000000 vertices"]);
+    case(&header("vertex 20", "vertex 1000000000000"), &["of 1000000000000: `x` is missing"]);
     case(&header("vertex 20", "vertex 99999999999999999999999"), &["header line 4", "not a whole number"]);
     case(&header("vertex 20", "vertex -1"), &["not a whole number"]);
     case(&header("vertex 20", "points 20"), &["no element `vertex`"]);
@@ -146,17 +146,18 @@ fn unsuitable_files_and_arguments_are_refused_by_name() {
     // A skipped element that claims far more rows than the file has.
     let skipped = "element vertex 20";
     let lists = "element face 4000000000\nproperty list uchar int i\nelement vertex 20";
-    case(&header(skipped, lists), &["element `face`"]);
+    case(&header(skipped, lists), &["of 4000000000: `i` is missing"]);
     case(
         &header(skipped, "element junk 9000000000000000000\nproperty double a\nelement vertex 20"),
-        &["element `junk`"],
+        &["of 9000000000000000000: `a` is missing"],
     );
     let ascii = text(&ply_bytes(&rows, Format::Ascii, "", b""));
-    case(ascii.replace("vertex 20", "vertex 21").as_bytes(), &["21 vertices", "20 are there"]);
-    case(ascii.replace("vertex 20", "vertex 1000000000").as_bytes(), &["1000000000 vertices"]);
+    case(ascii.replace("vertex 20", "vertex 21").as_bytes(), &["vertex 20 of 21: `x`"]);
+    case(ascii.replace("vertex 20", "vertex 1000000000").as_bytes(), &["vertex 20 of 1000000000"]);
     let last = ascii.trim_end().rfind(' ').expect("numbers");
-    case(&ascii.as_bytes()[..last], &["vertex 19", "values, expected 26"]);
-    case(format!("{} zero\n", &ascii[..last]).as_bytes(), &["vertex 19: `rot_3` is `zero`"]);
+    case(&ascii.as_bytes()[..last], &["vertex 19 of 20: `rot_3` is missing"]);
+    case(format!("{} 1 2\n", &ascii[..last]).as_bytes(), &["vertex 19 of 20: `rot_3` is not the last value"]);
+    case(format!("{} zero\n", &ascii[..last]).as_bytes(), &["vertex 19 of 20: `rot_3` is `zero`"]);
 
     place.write("folder", b"");
     place.write("wide.json", br#"[{"width":8,"height":4,"fx":9,"fy":9,"cx":4,"cy":2,"world_to_camera":[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]},{"width":4,"height":4,"fx":9,"fy":9,"cx":4,"cy":2,"world_to_camera":[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]}]"#);

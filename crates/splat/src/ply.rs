@@ -1,6 +1,7 @@
 //! 3D Gaussian PLY files in the layout of the INRIA viewer. Binary little-endian files are written; ASCII and binary
 //! files are read.
 
+pub mod body;
 pub mod header;
 mod read;
 
@@ -8,6 +9,7 @@ use std::io::{self, Write};
 
 use crate::stored::Stored;
 
+pub use crate::stored::Problem;
 pub(crate) use read::read;
 
 /// Properties of one vertex of SH degree 0, in INRIA's order; higher degrees add `f_rest_*` after `f_dc_2`. Missing

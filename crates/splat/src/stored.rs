@@ -191,9 +191,11 @@ impl Stored {
 
 /// Reason why a file cannot be read.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Problem {
+pub enum Problem {
+    /// A failing disk.
     #[error(transparent)]
     Io(#[from] io::Error),
+    /// A fault of the content, without the file's name.
     #[error("{0}")]
     Content(String),
 }

@@ -3,11 +3,12 @@
 
 use std::collections::HashMap;
 use std::path::Path;
-use std::str::SplitAsciiWhitespace;
 
 use glam::{Vec2, Vec3};
-use snapsnap_base::{FileError, file, quoted};
-use snapsnap_splat::ply::header::{Element, Format, Scalar, parse};
+use snapsnap_base::{FileError, file};
+use snapsnap_splat::ply::Problem;
+use snapsnap_splat::ply::body::Body;
+use snapsnap_splat::ply::header::{Element, Scalar, parse};
 
 use super::{MAX_BYTES, Textures, triangles};
 use crate::mesh::{Face, Material, Mesh};
@@ -21,15 +22,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     let bytes = file::read(path, MAX_BYTES).map_err(FileError::read(path))?;
     let wrong = |problem: String| FileError::unsuitable(path, problem);
     let header = parse(&bytes).map_err(wrong)?;
-    let body = &bytes[header.len..];
-    let mut body = match header.format {
-        Format::Ascii => Body::Text(
-            std::str::from_utf8(body)
-                .map_err(|_| wrong("the body is not text, though the format is ascii".into()))?
-                .split_ascii_whitespace(),
-        ),
-        format => Body::Binary { bytes: body, big: format == Format::BigEndian },
-    };
+    let mut body = Body::new(&bytes[header.len..], header.format);
     let mut mesh = Mesh::default();
     let mut textures = Textures::new();
     for name in header.comments.iter().filter_map(|comment| comment.strip_prefix("TextureFile")) {
@@ -44,15 +37,9 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
         match element.name.as_str() {
             "vertex" => vertices(element, &mut body, &mut mesh),
             "face" => faces(element, &mut body, &mut mesh, &mut polygons),
-            // Elements without properties have no bytes in the file.
-            _ if element.properties.is_empty() => Ok(()),
-            _ => (0..element.count).try_for_each(|row| {
-                let skip =
-                    |body: &mut Body, column: usize| body.number(element.properties[column].kind).map(drop);
-                read_row(element, row, usize::MAX, &mut body, skip)
-            }),
+            _ => body.skip(element),
         }
-        .map_err(wrong)?;
+        .map_err(|problem| FileError::unsuitable(path, problem))?;
     }
     polygons.build(&mut mesh).map_err(wrong)?;
     let is_textured = mesh.materials.iter().any(|material| material.texture.is_some());
@@ -94,72 +81,6 @@ impl Polygons {
     }
 }
 
-/// The values after the header.
-enum Body<'a> {
-    Text(SplitAsciiWhitespace<'a>),
-    Binary { bytes: &'a [u8], big: bool },
-}
-
-/// The next value of a binary body in little-endian order, padded with zeros to eight bytes.
-fn take(bytes: &mut &[u8], kind: Scalar, big: bool) -> Option<[u8; 8]> {
-    let (value, rest) = bytes.split_at_checked(kind.size())?;
-    *bytes = rest;
-    let mut out = [0; 8];
-    out[..value.len()].copy_from_slice(value);
-    if big {
-        out[..value.len()].reverse();
-    }
-    Some(out)
-}
-
-impl Body<'_> {
-    /// The next value as a number; `None` at the end and for text that is no number.
-    fn number(&mut self, kind: Scalar) -> Option<f32> {
-        match self {
-            Self::Text(words) => words.next()?.parse().ok(),
-            Self::Binary { bytes, big } => take(bytes, kind, *big).map(|b| kind.read(&b)),
-        }
-    }
-
-    /// The next value as a length or an index.
-    fn count(&mut self, kind: Scalar) -> Option<usize> {
-        match self {
-            Self::Text(words) => words.next()?.parse().ok(),
-            Self::Binary { bytes, big } => kind.read_count(&take(bytes, kind, *big)?[..kind.size()]),
-        }
-    }
-}
-
-/// Reads one row of an element. `value` receives the index of a property and reads its next value. It returns `None`
-/// for a value that is missing or no number.
-///
-/// # Errors
-/// A missing or wrong value, or a list of more than `longest` values.
-fn read_row(
-    element: &Element,
-    row: usize,
-    longest: usize,
-    body: &mut Body,
-    mut value: impl FnMut(&mut Body, usize) -> Option<()>,
-) -> Result<(), String> {
-    for (column, property) in element.properties.iter().enumerate() {
-        let broken = || {
-            let (name, count) = (quoted(&element.name), element.count);
-            let property = quoted(&property.name);
-            format!("{name} {row} of {count}: `{property}` is missing or no number; the file may be cut off")
-        };
-        let length = property.list.map_or(Some(1), |kind| body.count(kind)).ok_or_else(broken)?;
-        if length > longest {
-            let (name, property) = (quoted(&element.name), quoted(&property.name));
-            return Err(format!("{name} {row}: `{property}` has {length} entries"));
-        }
-        for _ in 0..length {
-            value(body, column).ok_or_else(broken)?;
-        }
-    }
-    Ok(())
-}
-
 /// Index of the property that has one of these names of different exporters.
 fn column(element: &Element, names: &[&str]) -> Option<usize> {
     element.properties.iter().position(|p| p.list.is_none() && names.contains(&p.name.as_str()))
@@ -181,18 +102,18 @@ fn intensity(value: f32, kind: Scalar) -> f32 {
     }
 }
 
-fn vertices(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), String> {
+fn vertices(element: &Element, body: &mut Body<&[u8]>, mesh: &mut Mesh) -> Result<(), Problem> {
     let place = ["x", "y", "z"].map(|name| column(element, &[name]));
     let [Some(x), Some(y), Some(z)] = place else {
-        return Err("`vertex` has no properties `x`, `y`, `z`".into());
+        return Err("`vertex` has no properties `x`, `y`, `z`".to_owned().into());
     };
     let color = colors(element);
     let s = column(element, &["s", "u", "texture_u"]);
     let texcoord = s.zip(column(element, &["t", "v", "texture_v"]));
     let mut values = vec![0.0; element.properties.len()];
     for row in 0..element.count {
-        read_row(element, row, usize::MAX, body, |body, column| {
-            values[column] = body.number(element.properties[column].kind)?;
+        body.row(element, row, usize::MAX, |column, value| {
+            values[column] = value.number()?;
             Some(())
         })?;
         mesh.positions.push(Vec3::new(values[x], values[y], values[z]));
@@ -206,15 +127,21 @@ fn vertices(element: &Element, body: &mut Body, mesh: &mut Mesh) -> Result<(), S
     Ok(())
 }
 
-fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh, polygons: &mut Polygons) -> Result<(), String> {
+fn faces(
+    element: &Element,
+    body: &mut Body<&[u8]>,
+    mesh: &mut Mesh,
+    polygons: &mut Polygons,
+) -> Result<(), Problem> {
     let is_corners = |name: &str| matches!(name, "vertex_indices" | "vertex_index");
     if !element.properties.iter().any(|p| p.list.is_some() && is_corners(&p.name)) {
-        return Err("`face` has no list `vertex_indices`".into());
+        return Err("`face` has no list `vertex_indices`".to_owned().into());
     }
     polygons.per_vertex = !mesh.texcoords.is_empty();
     let is_number = |name: &str| matches!(name, "texnumber" | "texture_number");
     if mesh.materials.len() > 1 && !element.properties.iter().any(|p| is_number(&p.name)) {
-        return Err(format!("it has {} textures, and `face` has no `texnumber`", mesh.materials.len()));
+        let textures = mesh.materials.len();
+        return Err(format!("it has {textures} textures, and `face` has no `texnumber`").into());
     }
     // Colours of vertices and textures show more than colours of faces.
     let is_plain = mesh.colors.is_empty() && mesh.materials.iter().all(|material| material.texture.is_none());
@@ -225,16 +152,16 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh, polygons: &mut Pol
         corners.clear();
         texcoords.clear();
         let (mut material, mut painted) = (0, [0.0; 3]);
-        read_row(element, row, MAX_CORNERS, body, |body, column| {
+        body.row(element, row, MAX_CORNERS, |column, value| {
             let property = &element.properties[column];
             match property.name.as_str() {
                 "vertex_indices" | "vertex_index" => {
-                    corners.push(u32::try_from(body.count(property.kind)?).ok()?);
+                    corners.push(u32::try_from(value.count()?).ok()?);
                 }
-                name if is_number(name) => material = u32::try_from(body.count(property.kind)?).ok()?,
-                "texcoord" => texcoords.push(body.number(property.kind)?),
+                name if is_number(name) => material = u32::try_from(value.count()?).ok()?,
+                "texcoord" => texcoords.push(value.number()?),
                 _ => {
-                    let value = body.number(property.kind)?;
+                    let value = value.number()?;
                     if let Some(channel) = color.and_then(|color| color.iter().position(|c| *c == column)) {
                         painted[channel] = intensity(value, property.kind);
                     }
@@ -250,7 +177,7 @@ fn faces(element: &Element, body: &mut Body, mesh: &mut Mesh, polygons: &mut Pol
             }
             if materials.len() > MAX_COLORS {
                 let advice = "give its vertices colours instead";
-                return Err(format!("its faces have more than {MAX_COLORS} colours: {advice}"));
+                return Err(format!("its faces have more than {MAX_COLORS} colours: {advice}").into());
             }
         }
         let first = mesh.texcoords.len() as u32;

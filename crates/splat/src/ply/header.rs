@@ -58,33 +58,18 @@ impl Scalar {
         }
     }
 
-    /// The value at the start of `bytes`, which are little-endian.
-    pub fn read(self, bytes: &[u8]) -> f32 {
-        let four = || [bytes[0], bytes[1], bytes[2], bytes[3]];
+    /// The value at the start of little-endian `bytes`, which is exact in every type.
+    pub fn read(self, bytes: [u8; 8]) -> f64 {
+        let [a, b, c, d, ..] = bytes;
         match self {
-            Self::I8 => f32::from(i8::from_le_bytes([bytes[0]])),
-            Self::U8 => f32::from(bytes[0]),
-            Self::I16 => f32::from(i16::from_le_bytes([bytes[0], bytes[1]])),
-            Self::U16 => f32::from(u16::from_le_bytes([bytes[0], bytes[1]])),
-            Self::I32 => i32::from_le_bytes(four()) as f32,
-            Self::U32 => u32::from_le_bytes(four()) as f32,
-            Self::F32 => f32::from_le_bytes(four()),
-            Self::F64 => {
-                let mut eight = [0; 8];
-                eight.copy_from_slice(&bytes[..8]);
-                f64::from_le_bytes(eight) as f32
-            }
-        }
-    }
-
-    /// The length or the index at the start of little-endian `bytes`. `None` for floats and negative numbers.
-    pub fn read_count(self, bytes: &[u8]) -> Option<usize> {
-        match self {
-            Self::F32 | Self::F64 => None,
-            Self::U32 => Some(u32::from_le_bytes(bytes.try_into().ok()?) as usize),
-            Self::I32 => i32::from_le_bytes(bytes.try_into().ok()?).try_into().ok(),
-            // Small enough to be exact in f32.
-            small => Some(small.read(bytes)).filter(|length| *length >= 0.0).map(|length| length as usize),
+            Self::I8 => f64::from(i8::from_le_bytes([a])),
+            Self::U8 => f64::from(a),
+            Self::I16 => f64::from(i16::from_le_bytes([a, b])),
+            Self::U16 => f64::from(u16::from_le_bytes([a, b])),
+            Self::I32 => f64::from(i32::from_le_bytes([a, b, c, d])),
+            Self::U32 => f64::from(u32::from_le_bytes([a, b, c, d])),
+            Self::F32 => f64::from(f32::from_le_bytes([a, b, c, d])),
+            Self::F64 => f64::from_le_bytes(bytes),
         }
     }
 }
@@ -173,20 +158,14 @@ pub fn parse(bytes: &[u8]) -> Result<Header, String> {
                 }
                 elements.push(Element { name: (*name).to_owned(), count, properties: Vec::new() });
             }
-            ["property", kind @ .., name] => {
+            ["property", types @ .., name] => {
                 let Some(element) = elements.last_mut() else { return wrong("no element before it") };
-                let types: Option<Vec<Scalar>> = match kind {
-                    ["list", types @ ..] if types.len() == 2 => {
-                        types.iter().map(|t| Scalar::parse(t)).collect()
-                    }
-                    [kind] => Scalar::parse(kind).map(|kind| vec![kind]),
+                let types = match types {
+                    ["list", length, kind] => Scalar::parse(kind).zip(Scalar::parse(length).map(Some)),
+                    [kind] => Scalar::parse(kind).map(|kind| (kind, None)),
                     _ => None,
                 };
-                let (kind, list) = match types.as_deref() {
-                    Some([kind]) => (*kind, None),
-                    Some([length, kind]) => (*kind, Some(*length)),
-                    _ => return wrong("no such type"),
-                };
+                let Some((kind, list)) = types else { return wrong("no such type") };
                 if element.properties.len() == MAX_PROPERTIES {
                     return wrong("too many properties");
                 }
