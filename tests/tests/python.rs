@@ -26,8 +26,11 @@ fn python() -> Option<PathBuf> {
 #[test]
 fn the_package_passes_its_own_tests() {
     let Some(python) = python() else { return };
-    let native = build(&["--package", "snapsnap-python", "--lib"], "snapsnap-python/python")
-        .join(format!("{}snapsnap_python{}", env::consts::DLL_PREFIX, env::consts::DLL_SUFFIX));
+    let native = build(&["--package", "snapsnap-python", "--lib"], "snapsnap-python/python").join(format!(
+        "{}snapsnap_python{}",
+        env::consts::DLL_PREFIX,
+        env::consts::DLL_SUFFIX
+    ));
     // The package as an installation has it.
     let folder = tempfile::tempdir().expect("folder");
     let package = folder.path().join("snapsnap");
@@ -41,7 +44,9 @@ fn the_package_passes_its_own_tests() {
     let suffix = if cfg!(windows) { "pyd" } else { "abi3.so" };
     fs::copy(&native, package.join(format!("_native.{suffix}"))).expect("copied");
     let mut tests = Command::new(python);
-    tests.args(["-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider"]).arg(root().join("crates/python/tests"));
+    tests
+        .args(["-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider"])
+        .arg(root().join("crates/python/tests"));
     tests.env("PYTHONPATH", folder.path()).env("PYTHONDONTWRITEBYTECODE", "1").current_dir(folder.path());
     println!("{}", succeed(&mut tests));
 }

@@ -141,7 +141,11 @@ fn devices_of_the_local_network_join_by_an_address() {
     let page = String::from_utf8(page).expect("text");
     assert!(status == 200 && page.contains("class=\"studio\""), "{page}");
     assert_eq!(ask("/", &host, "Cookie: snapsnap=0\r\n").0, 403, "another cookie");
-    assert_eq!(ask("/", &host, &format!("{cookie}Origin: http://evil.example\r\n")).0, 200, "the page itself");
+    assert_eq!(
+        ask("/", &host, &format!("{cookie}Origin: http://evil.example\r\n")).0,
+        200,
+        "the page itself"
+    );
     let foreign = format!("{cookie}Origin: http://evil.example\r\n");
     assert_eq!(ask("/progress", &host, &foreign).0, 403, "a page of another site");
     assert_eq!(ask("/invitation", &host, &cookie).0, 404, "guests invite nobody");

@@ -10,8 +10,8 @@ use qrcode::{EcLevel, QrCode};
 
 use crate::failure::{Failure, bail};
 use crate::page::{answer, text};
-use crate::server::{Answer, Request};
 use crate::say;
+use crate::server::{Answer, Request};
 
 /// Path of an address for one device, before its key.
 const JOIN: &str = "/join/";
@@ -53,7 +53,9 @@ impl Guests {
         let address = self.address();
         if let Ok(code) = QrCode::with_error_correction_level(&address, EcLevel::L) {
             let picture = code.render::<unicode::Dense1x2>();
-            say::note(&picture.dark_color(unicode::Dense1x2::Light).light_color(unicode::Dense1x2::Dark).build());
+            say::note(
+                &picture.dark_color(unicode::Dense1x2::Light).light_color(unicode::Dense1x2::Dark).build(),
+            );
         }
         say::note(&format!("{address}\nleads one device of the local network here; nothing is encrypted"));
     }

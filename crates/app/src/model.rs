@@ -111,8 +111,8 @@ pub struct CameraArguments {
 impl CameraArguments {
     /// These options, replaced by a page's fields: JSON of names and texts.
     pub fn updated(self, fields: &str) -> Result<Self, Failure> {
-        let parsed: HashMap<String, String> = serde_json::from_str(fields)
-            .map_err(|e| Failure::Input(format!("the page's fields: {e}")))?;
+        let parsed: HashMap<String, String> =
+            serde_json::from_str(fields).map_err(|e| Failure::Input(format!("the page's fields: {e}")))?;
         let mut updated = self;
         for (name, text) in parsed {
             let field = match name.as_str() {

@@ -54,7 +54,9 @@ pub fn run<T: Send + 'static>(
     match worker.join() {
         Ok(made) => made.map_err(exception),
         // The panic itself is on stderr.
-        Err(_) => Err(PyRuntimeError::new_err("a fault of this package: please report what is printed above")),
+        Err(_) => {
+            Err(PyRuntimeError::new_err("a fault of this package: please report what is printed above"))
+        }
     }
 }
 

@@ -15,9 +15,8 @@ pub(crate) fn read(mut input: impl Read, length: u64) -> Result<Stored, Problem>
     }
     let mut bytes = Vec::new();
     input.read_to_end(&mut bytes)?;
-    let float = |at: usize, row: &[u8]| {
-        f32::from_le_bytes(row[4 * at..4 * at + 4].try_into().expect("four bytes"))
-    };
+    let float =
+        |at: usize, row: &[u8]| f32::from_le_bytes(row[4 * at..4 * at + 4].try_into().expect("four bytes"));
     let column = |of: &dyn Fn(&[u8]) -> f32| bytes.chunks_exact(BYTES).map(of).collect::<Vec<f32>>();
     let mut columns = Vec::new();
     columns.extend((0..3).map(|axis| column(&|row| float(axis, row))));

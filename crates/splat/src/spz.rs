@@ -63,7 +63,8 @@ pub(crate) fn read_streams(mut input: impl Read, length: u64) -> Result<Stored, 
         let entry = entries.next().ok_or_else(|| format!("there is no stream of {what}"))?;
         let compressed = u64::from_le_bytes(entry[..8].try_into().expect("eight bytes"));
         let mut stream = (&mut input).take(compressed);
-        let damaged = |e: &dyn std::fmt::Display| Problem::from(format!("the stream of {what} is damaged: {e}"));
+        let damaged =
+            |e: &dyn std::fmt::Display| Problem::from(format!("the stream of {what} is damaged: {e}"));
         let decoder = ruzstd::decoding::StreamingDecoder::new(&mut stream).map_err(|e| damaged(&e))?;
         let mut bytes = Vec::new();
         decoder.take(size as u64 + 1).read_to_end(&mut bytes).map_err(|e| damaged(&e))?;

@@ -39,8 +39,7 @@ impl AxesArguments {
     /// Refuses y down for kinds of files whose axes viewers know.
     pub fn check(&self, output: &Path) -> Result<(), Failure> {
         if self.y_down && (Kind::of(output) != Kind::Ply || is_page(output)) {
-            let message =
-                "--y-down is for PLYs: an SPZ and a GLB have y up by definition, a SOG and a page are turned already";
+            let message = "--y-down is for PLYs: an SPZ and a GLB have y up by definition, a SOG and a page are turned already";
             return Err(Failure::file(output, message));
         }
         Ok(())

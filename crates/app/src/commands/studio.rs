@@ -164,9 +164,8 @@ impl Studio {
         let config = networks.config();
         let told = self.camera.updated(request.header("x-told").unwrap_or("{}"));
         // A page has no options, whose dashes the message begins with.
-        let wrong = |e: Failure| {
-            text(StatusCode::UNPROCESSABLE_ENTITY, e.to_string().trim_start_matches('-'))
-        };
+        let wrong =
+            |e: Failure| text(StatusCode::UNPROCESSABLE_ENTITY, e.to_string().trim_start_matches('-'));
         let told = &told.and_then(|camera| camera.told(config, false)).map_err(wrong)?;
         let (side, placement) = (config.network.resolution, told.placement(config));
         let mut read =

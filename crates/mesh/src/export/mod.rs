@@ -63,7 +63,9 @@ pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
     match Kind::named(path) {
         Some(Kind::Obj) => obj::write(mesh, path),
         Some(Kind::Ply) => ply::write(mesh, path),
-        Some(Kind::Stl) => write_whole(path, |out| print::write_stl(mesh, out)).map_err(FileError::write(path)),
+        Some(Kind::Stl) => {
+            write_whole(path, |out| print::write_stl(mesh, out)).map_err(FileError::write(path))
+        }
         Some(Kind::ThreeMf) => {
             write_whole(path, |out| print::write_3mf(mesh, out)).map_err(FileError::write(path))
         }

@@ -58,7 +58,7 @@ impl Scalar {
         }
     }
 
-    /// The value at the start of little-endian `bytes`. No type has more digits.
+    /// The value at the start of little-endian `bytes`, which is exact in every type.
     pub fn read(self, bytes: [u8; 8]) -> f64 {
         let [a, b, c, d, ..] = bytes;
         match self {

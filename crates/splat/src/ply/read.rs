@@ -4,8 +4,8 @@
 use std::io::{BufRead, BufReader, Cursor, Read};
 
 use super::body::Body;
-use super::{Y_DOWN, compressed};
 use super::header::{Header, MAX_HEADER, Scalar, parse};
+use super::{Y_DOWN, compressed};
 use crate::sh;
 use crate::stored::{COEFFICIENTS, Problem, Stored};
 use snapsnap_base::quoted;

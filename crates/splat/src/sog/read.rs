@@ -17,9 +17,8 @@ const ENTRIES: u32 = 64;
 /// Bytes of a Gaussian in memory: its columns, and its pixels of five pictures.
 const BYTES: u64 = 14 * 4 + 5 * 4;
 /// For each SH basis function, whether a turn by 180° about z negates it.
-const REVERSED: [bool; 16] = [
-    false, true, false, true, false, true, false, true, false, true, false, true, false, true, false, true,
-];
+const REVERSED: [bool; 16] =
+    [false, true, false, true, false, true, false, true, false, true, false, true, false, true, false, true];
 
 /// Reads a SOG, a ZIP archive of `length` bytes.
 pub(crate) fn read(mut input: impl Read, length: u64) -> Result<Stored, Problem> {
@@ -51,8 +50,7 @@ pub(crate) fn read(mut input: impl Read, length: u64) -> Result<Stored, Problem>
     let (quats, scales, sh0) = (of_each("quats", 0)?, of_each("scales", 0)?, of_each("sh0", 0)?);
     let [mins, maxs] = ["mins", "maxs"].map(|name| numbers(&meta["means"][name], 3, "means"));
     let (mins, maxs) = (mins?, maxs?);
-    let [scale_book, color_book] =
-        ["scales", "sh0"].map(|part| numbers(&meta[part]["codebook"], 256, part));
+    let [scale_book, color_book] = ["scales", "sh0"].map(|part| numbers(&meta[part]["codebook"], 256, part));
     let (scale_book, color_book) = (scale_book?, color_book?);
 
     let mut columns: Vec<Vec<f32>> = Vec::new();
