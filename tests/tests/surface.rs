@@ -112,6 +112,44 @@ fn a_shell_becomes_one_closed_surface_of_its_size_and_colours_in_every_kind_of_f
     }
 }
 
+/// Printers' programs read millimetres with z up. trimesh, numpy-stl and lib3mf (strictly) have read such files.
+#[test]
+fn printers_get_the_surface_in_millimetres() {
+    let place = Workplace::empty();
+    written_around(&place.path("human.ply"), CENTRE, 1.0);
+    for name in ["a.ply", "a.stl", "a.3mf"] {
+        succeed(&mut mesh_of(&place, "human.ply", name, "--faces 3000"));
+    }
+    let mesh = import::read(&place.path("a.ply")).expect("a mesh");
+    let printed = |row: u32| {
+        let position = 1000.0 * mesh.positions[row as usize];
+        Vec3::new(position.x, -position.z, position.y)
+    };
+    let stl = place.read("a.stl");
+    assert_eq!(stl.len(), 84 + 50 * mesh.faces.len());
+    assert_eq!(u32::from_le_bytes(stl[80..84].try_into().expect("four")) as usize, mesh.faces.len());
+    for (bytes, face) in stl[84..].chunks_exact(50).zip(&mesh.faces) {
+        let vector = |at: usize| {
+            Vec3::from_array([0, 4, 8].map(|axis| {
+                f32::from_le_bytes(bytes[12 * at + axis..12 * at + axis + 4].try_into().expect("four"))
+            }))
+        };
+        assert_eq!([1, 2, 3].map(vector), face.positions.map(printed));
+        let outward = vector(0).dot((vector(2) - vector(1)).cross(vector(3) - vector(1)));
+        assert!(outward >= 0.0 && vector(0).length() < 1.001);
+    }
+    let file = std::fs::File::open(place.path("a.3mf")).expect("a file");
+    let mut archive = zip::ZipArchive::new(file).expect("a ZIP");
+    let model = archive.by_name("3D/3dmodel.model").expect("a model");
+    let model = std::io::read_to_string(model).expect("text");
+    assert!(model.contains("unit=\"millimeter\""));
+    assert_eq!(model.matches("<vertex ").count(), mesh.positions.len());
+    assert_eq!(model.matches("<triangle ").count(), mesh.faces.len());
+    let Vec3 { x, y, z } = printed(7);
+    let vertex = model.lines().filter(|line| line.starts_with("<vertex")).nth(7).expect("the eighth");
+    assert_eq!(vertex, format!("<vertex x=\"{x:.4}\" y=\"{y:.4}\" z=\"{z:.4}\"/>"));
+}
+
 /// Level cameras do not see the crown of a head.
 #[test]
 fn a_hole_at_the_top_is_closed_and_the_inside_stays_solid() {
@@ -274,7 +312,7 @@ fn meshes_that_cannot_be_are_refused() {
     place.write("empty.ply", nothing);
     for (file, to, more, expected) in [
         ("human.ply", "a.stl", "", "neither .glb nor .obj nor .ply"),
-        ("human.ply", "a.ply", "--texture 512", "a PLY has no texture"),
+        ("human.ply", "a.ply", "--texture 512", "this kind has no texture"),
         ("human.ply", "no/such/folder/a.glb", "", "cannot write"),
         ("human.ply", "a.glb", "--texture 3", "64"),
         ("human.ply", "a.obj", "--texture 64", "belongs to no mesh of this name"),

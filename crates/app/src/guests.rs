@@ -52,7 +52,7 @@ impl Guests {
     pub fn invite(&self) {
         let address = self.address();
         if let Ok(code) = QrCode::with_error_correction_level(&address, EcLevel::L) {
-            let picture = code.render::<unicode::Dense1x2>();
+            let mut picture = code.render::<unicode::Dense1x2>();
             say::note(
                 &picture.dark_color(unicode::Dense1x2::Light).light_color(unicode::Dense1x2::Dark).build(),
             );

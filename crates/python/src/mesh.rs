@@ -14,7 +14,7 @@ use crate::work::{run, unsuitable};
 
 /// A textured or coloured triangle mesh.
 #[pyclass(frozen)]
-pub struct Mesh(Arc<snapsnap_mesh::Mesh>);
+pub struct Mesh(Arc<snapsnap_mesh::mesh::Mesh>);
 
 #[pymethods]
 impl Mesh {

@@ -75,9 +75,11 @@ def test_files_give_back_what_was_saved(person, tmp_path):
         read = snapsnap.load(tmp_path / f"human.{kind}")
         np.testing.assert_allclose(read.means, person.means, atol=tolerance)
         np.testing.assert_allclose(read.scales, person.scales, rtol=0.1, atol=1e-6)
+    # A SOG has another order.
     person.save(tmp_path / "human.sog")
-    with pytest.raises(snapsnap.InputError, match="human.sog"):
-        snapsnap.load(tmp_path / "human.sog")
+    read = snapsnap.load(tmp_path / "human.sog")
+    assert len(read) == len(person)
+    np.testing.assert_allclose(np.sort(read.means, axis=0), np.sort(person.means, axis=0), atol=1e-4)
 
 
 def test_renders_show_the_person(person):

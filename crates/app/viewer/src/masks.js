@@ -20,7 +20,7 @@ const SEEN = 0.5;
 const canvasOf = (width, height) => Object.assign(document.createElement("canvas"), { width, height });
 
 export class Drawing {
-  /** `drawn` is called after each change of the strokes. */
+  /** `drawn` gets the drawing after each change of its strokes. */
   constructor(canvas, drawn) {
     this.canvas = canvas;
     this.drawn = drawn;
@@ -88,7 +88,7 @@ export class Drawing {
     if (this.current) {
       this.current = null;
       this.pointer = null;
-      this.drawn();
+      this.drawn(this);
     }
   }
 
@@ -124,7 +124,7 @@ export class Drawing {
     this.lines = [];
     this.undone = [];
     this.current = null;
-    this.drawn?.();
+    this.drawn(this);
   }
 
   /** Shows a picture and its mask, white on the person, both of one size, and the person's joints. */
@@ -162,7 +162,7 @@ export class Drawing {
     }
     to.push(from.pop());
     this.renew();
-    this.drawn();
+    this.drawn(this);
   }
 
   place(event) {

@@ -21,7 +21,7 @@ class Photograph {
     this.file = null;
     this.signs = [];
     this.asked = 0;
-    this.drawing = new Drawing(this.root.querySelector("canvas"), () => this.drawn());
+    this.drawing = new Drawing(this.root.querySelector("canvas"), (strokes) => this.drawn(strokes));
     const part = (selector) => this.root.querySelector(selector);
     for (const input of this.root.querySelectorAll("input[type=file]")) {
       input.addEventListener("change", () => {
@@ -56,7 +56,6 @@ class Photograph {
     const zoom = part(".zoom");
     zoom.addEventListener("input", () => this.drawing.zoom(zoom.value));
     this.choose(part(".brush"));
-    this.drawn();
   }
 
   /** Makes it the front or the back. */
@@ -88,9 +87,9 @@ class Photograph {
     this.drawing.keeps = brush.dataset.keeps === "true";
   }
 
-  drawn() {
-    this.root.querySelector(".undo").disabled = this.drawing.lines.length === 0;
-    this.root.querySelector(".redo").disabled = this.drawing.undone.length === 0;
+  drawn(strokes) {
+    this.root.querySelector(".undo").disabled = strokes.lines.length === 0;
+    this.root.querySelector(".redo").disabled = strokes.undone.length === 0;
   }
 
   get busy() {

@@ -173,9 +173,9 @@ fn glbs_of_every_writer_are_read() {
     assert!(shining.texture.is_some() && shining.color.abs_diff_eq(Vec3::ONE, 1e-6));
     // Half of the texture, turned by 90° counter-clockwise and moved.
     let transform = r#""KHR_texture_transform":{"offset":[0.25,0.5],"rotation":1.5707963,"scale":[0.5,1]}"#;
-    let changed = PLAIN.replace(r#""index":0"#, &format!(r#""index":0,"extensions":{{{transform}}}"#));
+    let turned = PLAIN.replace(r#""index":0"#, &format!(r#""index":0,"extensions":{{{transform}}}"#));
     let places =
-        texcoords(&mesh(with(&changed, SOURCE, &required("KHR_texture_transform"))), 0).expect("has some");
+        texcoords(&mesh(with(&turned, SOURCE, &required("KHR_texture_transform"))), 0).expect("has some");
     // From (0, 1), (1, 1), (0, 0), counted from the top.
     for (found, [u, v]) in places.iter().zip([[1.25, 0.5], [1.25, 0.0], [0.25, 0.5]]) {
         assert!(found.abs_diff_eq(Vec2::new(u, 1.0 - v), 1e-6), "{places:?}");
