@@ -15,7 +15,6 @@
 //! subject, is renamed last.
 
 mod check;
-mod consistency;
 mod description;
 mod files;
 mod fingerprint;
