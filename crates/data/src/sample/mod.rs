@@ -4,10 +4,8 @@ mod augment;
 mod four_views;
 mod loader;
 mod photograph_changes;
-mod rectified;
 mod scene;
-mod stage1;
-mod stage2;
+mod stages;
 mod test_set;
 #[cfg(test)]
 mod tests;
@@ -31,8 +29,7 @@ pub use photograph_changes::{PhotographChanges, Road};
 use snapsnap_base::FileError;
 use snapsnap_base::config::outside;
 use snapsnap_base::random::stream;
-pub use stage1::{Stage1, Stage1Batch, Stage1Item};
-pub use stage2::{Stage2, Stage2Item};
+pub use stages::{Stage1, Stage1Batch, Stage1Item, Stage2, Stage2Item};
 pub use test_set::{Test, TestItem};
 
 /// Least mask value, of 255, at which a pixel counts as the person.
