@@ -6,10 +6,9 @@ mod atlas;
 mod color;
 mod grid;
 mod manifold;
-mod parts;
 mod simplify;
 mod stray;
-mod tunnels;
+mod topology;
 mod views;
 
 use std::collections::HashMap;
