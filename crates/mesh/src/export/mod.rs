@@ -3,10 +3,9 @@
 
 mod glb;
 mod obj;
-mod ply;
 mod print;
 
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -14,7 +13,7 @@ use image::{ImageFormat, RgbImage};
 use snapsnap_base::FileError;
 use snapsnap_base::file::write_whole;
 
-use crate::mesh::Mesh;
+use crate::mesh::{Mesh, bytes};
 
 pub use glb::glb_bytes;
 pub use obj::write as write_obj;
@@ -62,7 +61,7 @@ impl Kind {
 pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
     match Kind::named(path) {
         Some(Kind::Obj) => obj::write(mesh, path),
-        Some(Kind::Ply) => ply::write(mesh, path),
+        Some(Kind::Ply) => write_ply(mesh, path),
         Some(Kind::Stl) => {
             write_whole(path, |out| print::write_stl(mesh, out)).map_err(FileError::write(path))
         }
@@ -71,6 +70,41 @@ pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
         }
         Some(Kind::Glb) | None => glb::write(mesh, path),
     }
+}
+
+/// Binary PLY of triangles with vertex colours.
+fn write_ply(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
+    if mesh.materials.iter().any(|material| material.texture.is_some()) {
+        let message = "a PLY has vertex colours and no texture: write a .glb or .obj";
+        return Err(FileError::unsuitable(path, message));
+    }
+    write_whole(path, |out| {
+        writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}", mesh.positions.len())?;
+        ["x", "y", "z"].iter().try_for_each(|axis| writeln!(out, "property float {axis}"))?;
+        if !mesh.colors.is_empty() {
+            write!(out, "property uchar red\nproperty uchar green\nproperty uchar blue\n")?;
+        }
+        writeln!(
+            out,
+            "element face {}\nproperty list uchar int vertex_indices\nend_header",
+            mesh.faces.len()
+        )?;
+        for (row, p) in mesh.positions.iter().enumerate() {
+            p.to_array().iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
+            if let Some(color) = mesh.colors.get(row) {
+                out.write_all(&bytes(*color))?;
+            }
+        }
+        for face in &mesh.faces {
+            out.write_all(&[3])?;
+            for row in face.positions {
+                let row = i32::try_from(row).map_err(io::Error::other)?;
+                out.write_all(&row.to_le_bytes())?;
+            }
+        }
+        Ok(())
+    })
+    .map_err(FileError::write(path))
 }
 
 /// Additional files that [`write()`] writes for a mesh with one texture, or without one.
