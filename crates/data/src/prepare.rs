@@ -13,9 +13,8 @@ use crate::dataset::{
     Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split,
 };
 use crate::light::LightConfig;
-use snapsnap_base::FileError;
 use snapsnap_base::config::{Schema, outside};
-use snapsnap_base::random::stream;
+use snapsnap_base::{FileError, random};
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Renderer, ViewOptions};
 
@@ -141,8 +140,8 @@ impl DataConfig {
     /// The cameras of a subject that faces `yaw_degrees` (docs/method.md, "Cameras"). `name` decides their random
     /// deviations.
     pub fn cameras(&self, yaw_degrees: f64, name: &str) -> Vec<Camera> {
-        let mut random = stream(&format!("cameras/{name}"));
-        let mut shifts = stream(&format!("shifts/{name}"));
+        let mut random = random::stream(&format!("cameras/{name}"));
+        let mut shifts = random::stream(&format!("shifts/{name}"));
         if self.views.arrangement == Arrangement::Groups {
             return (0..self.views.count / 4)
                 .flat_map(|_| self.group(yaw_degrees, &mut random, &mut shifts))

@@ -4,13 +4,12 @@ use std::path::Path;
 
 use glam::{Mat3, Vec3};
 use rand::Rng;
-use snapsnap_base::{FileError, file, quoted};
+use snapsnap_base::{FileError, file, folder, quoted};
 
 use crate::figure::{Pose, sign};
 use crate::joint_names::{Name, known, need};
 use crate::math::{rotate_x, rotate_y, rotate_z};
 use crate::skeleton::hanging;
-use snapsnap_base::folder::with_ending;
 
 /// Largest file, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
@@ -39,7 +38,7 @@ impl Poses {
     /// [`FileError`] for a folder or a file that cannot be read.
     pub fn open(folder: &Path) -> Result<Option<Self>, FileError> {
         let mut poses = Vec::new();
-        for path in with_ending(folder, "bvh")? {
+        for path in folder::with_ending(folder, "bvh")? {
             poses.extend(read(&path)?.into_iter().filter(Pose::stands));
         }
         Ok((!poses.is_empty()).then_some(Self { poses }))

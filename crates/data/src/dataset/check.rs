@@ -12,8 +12,7 @@ use rayon::prelude::*;
 use super::views::split_alpha;
 use super::write::UNFINISHED;
 use super::{Arrangement, DepthMap, Description, Folder, Layout, Person, Split, name};
-use snapsnap_base::FileError;
-use snapsnap_base::folder::entries;
+use snapsnap_base::{FileError, folder};
 use snapsnap_net::dilated;
 use snapsnap_splat::{Camera, RigidTransform};
 
@@ -91,7 +90,7 @@ fn orphans(folder: &Folder, split: Option<Split>, subjects: &[String]) -> Vec<St
     let mut problems = Vec::new();
     for kind in folder.kinds().iter().filter(|kind| **kind != "img") {
         let path = folder.split_path(split).join(kind);
-        for path in entries(&path).unwrap_or_default() {
+        for path in folder::entries(&path).unwrap_or_default() {
             let name = name(&path);
             let subject = name.strip_suffix(".json").unwrap_or(&name).to_owned();
             if !subjects.contains(&subject) {
@@ -108,7 +107,7 @@ fn unexpected(folder: &Folder, person: Person<'_>) -> Vec<String> {
     let views = folder.description().views;
     let mut extra = BTreeSet::new();
     for kind in folder.kinds().iter().filter(|kind| **kind != "cameras") {
-        for path in entries(&person.path(kind)).unwrap_or_default() {
+        for path in folder::entries(&person.path(kind)).unwrap_or_default() {
             let number: String = name(&path).chars().take_while(char::is_ascii_digit).collect();
             if !number.parse().is_ok_and(|view: usize| view < views) {
                 extra.insert(format!("{}: belongs to none of the {views} views", path.display()));

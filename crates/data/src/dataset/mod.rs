@@ -27,8 +27,7 @@ use std::fmt::Display;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use snapsnap_base::folder::entries;
-use snapsnap_base::{FileError, file};
+use snapsnap_base::{FileError, file, folder};
 
 pub use check::{Checked, check};
 pub use description::DESCRIPTION;
@@ -156,7 +155,7 @@ impl Folder {
     /// [`FileError::Read`] for a missing split.
     pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, FileError> {
         let folder = self.split_path(split).join("img");
-        Ok(entries(&folder)?.iter().filter(|path| path.is_dir()).map(|path| name(path)).collect())
+        Ok(folder::entries(&folder)?.iter().filter(|path| path.is_dir()).map(|path| name(path)).collect())
     }
 
     /// Reads a file of the data set.

@@ -10,8 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{ImageFormat, RgbImage};
-use snapsnap_base::FileError;
-use snapsnap_base::file::write_whole;
+use snapsnap_base::{FileError, file};
 
 use crate::mesh::{Mesh, bytes};
 
@@ -67,7 +66,7 @@ pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
         let message = "a PLY has vertex colours and no texture: write a .glb or .obj";
         return Err(FileError::unsuitable(path, message));
     }
-    write_whole(path, |out| match kind {
+    file::write_whole(path, |out| match kind {
         Kind::Ply => write_ply(mesh, out),
         Kind::Stl => print::write_stl(mesh, out),
         Kind::ThreeMf => print::write_3mf(mesh, out),
