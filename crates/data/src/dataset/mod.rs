@@ -98,7 +98,7 @@ impl Folder {
             .find_map(|split| Some((split, folder.subjects(split).ok()?.into_iter().next()?)))
             .ok_or_else(|| foreign("no subject lies in img, train/img, val/img or test/img"))?;
         let first = folder.person(split, &subject).picture_path(0);
-        let [width, _] = picture::size(&first)?;
+        let [width, _] = picture::size(&first, None)?;
         folder.description.resolution = width;
         folder.description.high_resolution = first.with_file_name("0_hr.jpg").is_file();
         if let Some(problem) = folder.description.problem() {
