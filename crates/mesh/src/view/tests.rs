@@ -180,12 +180,8 @@ fn neighbouring_triangles_share_no_sample_and_leave_none_out() {
             let inner = |i: u32, shift: f32| if i == 0 || i == n { 0.0 } else { shift };
             let (dx, dy) = (inner(x, random() - 0.5), inner(y, random() - 0.5));
             let z = 2.0 + 0.3 * random();
-            let at = Vec3::new(
-                (x as f32 + 0.7 * dx) / n as f32 - 0.5,
-                (y as f32 + 0.7 * dy) / n as f32 - 0.5,
-                1.0,
-            );
-            positions.push(at * z);
+            let at = Vec2::new(x as f32 + 0.7 * dx, y as f32 + 0.7 * dy) / n as f32 - 0.5;
+            positions.push(at.extend(1.0) * z);
         }
     }
     let faces = cells(n);

@@ -152,13 +152,9 @@ fn restored_points_lie_on_the_photographed_person() {
         };
         let scaled: Vec<f32> = points.iter().map(|value| restoration.scale as f32 * value).collect();
         // Some points lie on the edge between two pixels.
-        let (wrong, before) = (off(&restored), off(&scaled));
-        assert!(
-            pixels.len() > 300 && wrong * 20 < pixels.len(),
-            "view {view}: {wrong} of {} points",
-            pixels.len()
-        );
-        assert!(before * 2 > pixels.len(), "view {view}: {before} of {} points", pixels.len());
+        let (wrong, before, all) = (off(&restored), off(&scaled), pixels.len());
+        assert!(all > 300 && wrong * 20 < all, "view {view}: {wrong} of {all} points");
+        assert!(before * 2 > all, "view {view}: {before} of {all} points");
     }
 }
 
