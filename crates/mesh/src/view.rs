@@ -138,13 +138,12 @@ impl<'a> Renderer<'a> {
         let (width, height) = (camera.width as usize, camera.height as usize);
         let corners: Vec<DVec3> =
             self.mesh.positions.par_iter().map(|p| camera.world_to_camera.apply(p.as_dvec3())).collect();
+        let projected = |(row, face): (usize, &Face)| {
+            let corners = face.positions.map(|row| corners[row as usize]);
+            triangle(corners, row, self.holes(face).is_some(), camera)
+        };
         let faces = self.mesh.faces.par_iter().enumerate();
-        let triangles: Vec<Triangle> = faces
-            .filter_map(|(row, face)| {
-                let corners = face.positions.map(|row| corners[row as usize]);
-                triangle(corners, row, self.holes(face).is_some(), camera)
-            })
-            .collect();
+        let triangles: Vec<Triangle> = faces.filter_map(projected).collect();
         let mut lists: Vec<Vec<u32>> = vec![Vec::new(); height.div_ceil(BAND)];
         for (index, t) in (0..).zip(&triangles) {
             let lists = &mut lists[t.rows[0] / BAND..=t.rows[1] / BAND];

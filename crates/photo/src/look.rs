@@ -255,10 +255,8 @@ impl Small {
         let main = (1..joints_in.len()).max_by_key(rank)?;
         let is_own = |piece: usize| piece == main || joints_in[piece] > 0;
         // Soft pixels belong to no piece; they stay.
-        mask.iter_mut()
-            .zip(&found.of)
-            .filter(|(_, of)| **of > 0 && !is_own(**of as usize))
-            .for_each(|(p, _)| *p = 0.0);
+        let others = mask.iter_mut().zip(&found.of).filter(|(_, of)| **of > 0 && !is_own(**of as usize));
+        others.for_each(|(p, _)| *p = 0.0);
 
         let step = side as f32 / SIDE as f32;
         let place = |x: f32, y: f32| self.scale * (corner.as_vec2() + step * Vec2::new(x, y));

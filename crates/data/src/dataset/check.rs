@@ -202,11 +202,9 @@ impl Seen {
     fn outside(&self, other: &Self) -> f64 {
         let (mut tried, mut outside) = (0, 0);
         for point in &other.points {
-            let cell = self
-                .camera
-                .project(*point)
-                .map(|(at, _)| (at * f64::from(self.side) / f64::from(self.camera.width)).floor());
             let size = f64::from(self.side);
+            let cell_of = |(at, _): (DVec2, f64)| (at * size / f64::from(self.camera.width)).floor();
+            let cell = self.camera.project(*point).map(cell_of);
             let cell = cell.filter(|c| c.cmpge(DVec2::ZERO).all() && c.max_element() < size);
             match cell {
                 None if self.is_cut => continue,

@@ -116,10 +116,8 @@ fn holds_its_shape(npy: &[u8]) -> bool {
         rest.split_once(')').map(|(shape, _)| shape)
     });
     let numbers = shape.and_then(|shape| {
-        let sides = shape.split(',').map(str::trim).filter(|side| !side.is_empty());
-        sides
-            .map(|side| side.parse::<usize>().ok())
-            .try_fold(1_usize, |product, side| product.checked_mul(side?))
+        let mut sides = shape.split(',').map(str::trim).filter(|side| !side.is_empty());
+        sides.try_fold(1_usize, |product, side| product.checked_mul(side.parse().ok()?))
     });
     numbers.is_some_and(|numbers| numbers <= npy.len() / 4)
 }

@@ -199,13 +199,11 @@ impl Folder {
             list(&self.split_path(split), MAX_DEPTH, &mut files)?;
         }
         files.sort_unstable();
-        let hashes: Vec<_> = files
-            .par_iter()
-            .map(|path| {
-                let (length, bytes) = ends(path).map_err(FileError::read(path))?;
-                Ok(Sha256::new().chain_update(length.to_le_bytes()).chain_update(bytes).finalize())
-            })
-            .collect::<Result<_, FileError>>()?;
+        let hash = |path: &PathBuf| {
+            let (length, bytes) = ends(path).map_err(FileError::read(path))?;
+            Ok::<_, FileError>(Sha256::new().chain_update(length.to_le_bytes()).chain_update(bytes).finalize())
+        };
+        let hashes = files.par_iter().map(hash).collect::<Result<Vec<_>, _>>()?;
         let mut whole = Sha256::new();
         whole.update(toml::to_string(&self.description).expect("the description has only TOML types"));
         for (path, hash) in files.iter().zip(hashes) {

@@ -59,11 +59,8 @@ pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
 
     let (mut primitives, mut materials, mut images) = (Vec::new(), Vec::new(), Vec::new());
     for (row, material) in mesh.materials.iter().enumerate() {
-        let faces = mesh.faces.iter().zip(&faces);
-        let corners: Vec<u32> = faces
-            .filter(|(face, _)| face.material as usize == row)
-            .flat_map(|(_, corners)| *corners)
-            .collect();
+        let faces = mesh.faces.iter().zip(&faces).filter(|(face, _)| face.material as usize == row);
+        let corners: Vec<u32> = faces.flat_map(|(_, corners)| *corners).collect();
         let [r, g, b] = material.color.to_array().map(linear_light);
         let mut surface =
             json!({ "baseColorFactor": [r, g, b, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0 });

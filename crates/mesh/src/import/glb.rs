@@ -238,11 +238,8 @@ impl File<'_> {
         if texture.is_some() && texcoords.is_empty() && count > 0 {
             return Err(self.wrong(format!("a primitive has a texture, but no `TEXCOORD_{set}`")));
         }
-        let colors: Vec<Vec3> = reader
-            .read_colors(0)
-            .into_iter()
-            .flat_map(|c| c.into_rgb_f32().map(|c| Vec3::from_array(c).map(shown)))
-            .collect();
+        let colors = reader.read_colors(0).into_iter().flat_map(|colors| colors.into_rgb_f32());
+        let colors: Vec<Vec3> = colors.map(|color| Vec3::from_array(color).map(shown)).collect();
         let indices: Option<Vec<u32>> = reader.read_indices().map(|indices| indices.into_u32().collect());
 
         for (found, what) in [(texcoords.len(), "texture coordinates"), (colors.len(), "colours")] {

@@ -90,14 +90,11 @@ impl Patch {
     /// One step of Catmull and Clark's subdivision; borders become smooth curves.
     pub fn subdivide(&self) -> Self {
         let count = self.vertices.len();
-        let middles: Vec<Vertex> = self
-            .faces
-            .iter()
-            .map(|face| {
-                let share = 1.0 / face.len() as f32;
-                Vertex::mean(face.iter().map(|row| (share, self.vertices[*row as usize])))
-            })
-            .collect();
+        let middle_of = |face: &Vec<u32>| {
+            let share = 1.0 / face.len() as f32;
+            Vertex::mean(face.iter().map(|row| (share, self.vertices[*row as usize])))
+        };
+        let middles: Vec<Vertex> = self.faces.iter().map(middle_of).collect();
         // Edge numbers by ends; ends and faces of each edge; edges and faces of each vertex.
         let mut rows: HashMap<(u32, u32), usize> = HashMap::new();
         let mut edges: Vec<((u32, u32), Vec<usize>)> = Vec::new();
