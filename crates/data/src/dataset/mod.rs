@@ -199,9 +199,9 @@ impl Folder {
             list(&self.split_path(split), MAX_DEPTH, &mut files)?;
         }
         files.sort_unstable();
-        let hash = |path: &PathBuf| {
+        let hash = |path: &PathBuf| -> Result<_, FileError> {
             let (length, bytes) = ends(path).map_err(FileError::read(path))?;
-            Ok::<_, FileError>(Sha256::new().chain_update(length.to_le_bytes()).chain_update(bytes).finalize())
+            Ok(Sha256::new().chain_update(length.to_le_bytes()).chain_update(bytes).finalize())
         };
         let hashes = files.par_iter().map(hash).collect::<Result<Vec<_>, _>>()?;
         let mut whole = Sha256::new();

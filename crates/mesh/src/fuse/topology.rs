@@ -180,10 +180,9 @@ impl Grid {
         let cube = (-side..=side).flat_map(|z| {
             (-side..=side).flat_map(move |y| (-side..=side).map(move |x| I64Vec3::new(x, y, z)))
         });
-        let ball: Vec<(I64Vec3, isize, u8)> = cube
-            .filter(|offset| offset.as_vec3().length() <= reach)
-            .map(|offset| (offset, self.step(offset), offset.length_squared() as u8))
-            .collect();
+        let ball = cube.filter(|offset| offset.as_vec3().length() <= reach);
+        let ball = ball.map(|offset| (offset, self.step(offset), offset.length_squared() as u8));
+        let ball: Vec<(I64Vec3, isize, u8)> = ball.collect();
         let strides = self.strides();
         let counts = self.counts.as_i64vec3();
         let mut distances: Vec<u8> = marked.iter().map(|marked| if *marked { 0 } else { FAR }).collect();

@@ -228,13 +228,10 @@ impl File<'_> {
         }
         let texture = base(&primitive.material()).1;
         let texcoords = primitive.get(&gltf::Semantic::TexCoords(set));
-        let texcoords: Vec<Vec2> = texcoords
-            .into_iter()
-            .flat_map(|rows| self.numbers::<2>(&rows))
-            .map(|at| texture.as_ref().map_or(at.into(), |texture| transformed(texture, at.into())))
-            // The origin of glTF's texture coordinates is at the top.
-            .map(|at| Vec2::new(at.x, 1.0 - at.y))
-            .collect();
+        let texcoords = texcoords.into_iter().flat_map(|rows| self.numbers::<2>(&rows)).map(Vec2::from_array);
+        let texcoords = texcoords.map(|at| texture.as_ref().map_or(at, |texture| transformed(texture, at)));
+        // The origin of glTF's texture coordinates is at the top.
+        let texcoords: Vec<Vec2> = texcoords.map(|at| Vec2::new(at.x, 1.0 - at.y)).collect();
         if texture.is_some() && texcoords.is_empty() && count > 0 {
             return Err(self.wrong(format!("a primitive has a texture, but no `TEXCOORD_{set}`")));
         }
