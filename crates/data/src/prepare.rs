@@ -149,14 +149,13 @@ impl DataConfig {
         }
         let mut rig = self.orbit(yaw_degrees);
         self.jitter.rig.apply(&mut rig, &mut random);
-        (0..self.views.count)
-            .map(|view| {
-                let mut orbit = rig;
-                orbit.yaw_degrees += view as f64 * 360.0 / self.views.count as f64;
-                self.jitter.view.apply(&mut orbit, &mut random);
-                self.jitter.rig.plus(&self.jitter.view).shifted(self.camera(orbit), &mut shifts)
-            })
-            .collect()
+        let camera = |view: usize| {
+            let mut orbit = rig;
+            orbit.yaw_degrees += view as f64 * 360.0 / self.views.count as f64;
+            self.jitter.view.apply(&mut orbit, &mut random);
+            self.jitter.rig.plus(&self.jitter.view).shifted(self.camera(orbit), &mut shifts)
+        };
+        (0..self.views.count).map(camera).collect()
     }
 
     /// The orbit of a camera without deviations.

@@ -135,11 +135,8 @@ fn parse(text: &str) -> Result<Vec<Pose>, String> {
             }
             "CHANNELS" => {
                 let row = own.ok_or("has channels outside of a joint")?;
-                let count: usize = words
-                    .next()
-                    .and_then(|word| word.parse().ok())
-                    .filter(|count| *count <= 6)
-                    .ok_or("has a joint without a number of channels up to 6")?;
+                let count = words.next().and_then(|word| word.parse::<usize>().ok()).filter(|n| *n <= 6);
+                let count = count.ok_or("has a joint without a number of channels up to 6")?;
                 let channels: Option<Vec<Channel>> = (0..count).map(|_| channel(words.next()?)).collect();
                 joints[row].channels = channels.ok_or("has a joint with unknown channels")?;
             }

@@ -90,9 +90,8 @@ impl File<'_> {
                 return Err(self.wrong(message));
             }
             let mut weights = [(0, 0.0); BONES];
-            for ((to, row), share) in
-                weights.iter_mut().zip(rows).zip(shares).filter(|(_, share)| *share > 0.0)
-            {
+            let parts = weights.iter_mut().zip(rows).zip(shares).filter(|(_, share)| *share > 0.0);
+            for ((to, row), share) in parts {
                 if usize::from(row) >= joints.len() {
                     let message =
                         format!("position {position} refers to joint {row} of a skin of {}", joints.len());

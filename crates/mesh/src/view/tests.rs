@@ -56,13 +56,11 @@ fn sphere(centre: Vec3, radius: f32, levels: usize) -> Mesh {
         }
     }
     for _ in 0..levels {
-        triangles = triangles
-            .iter()
-            .flat_map(|[a, b, c]| {
-                let [ab, bc, ca] = [*a + *b, *b + *c, *c + *a].map(Vec3::normalize);
-                [[*a, ab, ca], [ab, *b, bc], [ca, bc, *c], [ab, bc, ca]]
-            })
-            .collect();
+        let split = |[a, b, c]: [Vec3; 3]| {
+            let [ab, bc, ca] = [a + b, b + c, c + a].map(Vec3::normalize);
+            [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+        };
+        triangles = triangles.into_iter().flat_map(split).collect();
     }
     let positions: Vec<Vec3> = triangles.iter().flatten().map(|p| centre + radius * *p).collect();
     let faces: Vec<[u32; 3]> = (0..triangles.len() as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
