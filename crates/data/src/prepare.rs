@@ -307,7 +307,8 @@ mod tests {
 
     #[test]
     fn jitter_stays_in_its_ranges_and_follows_the_name() {
-        let jitter = Jitter {
+        let mut config = DataConfig::default();
+        config.jitter.view = Jitter {
             yaw: 5.0,
             pitch: 4.0,
             roll: 3.0,
@@ -316,8 +317,6 @@ mod tests {
             look_at: 0.05,
             ..Jitter::default()
         };
-        let mut config = DataConfig::default();
-        config.jitter.view = jitter;
         let cameras = |name: &str| config.cameras(0.0, name);
         assert_eq!(cameras("a"), cameras("a"));
         assert_ne!(cameras("a"), cameras("b"));

@@ -138,9 +138,8 @@ fn coverage_counts_the_samples_between_the_edges() {
         p.extend(2.0).as_vec3()
     };
     for samples in 1..=6 {
-        for (left, right, top, bottom) in
-            [(5.3, 30.8, 4.6, 22.1), (7.0, 29.0, 6.0, 20.0), (9.5, 9.9, 3.2, 27.7)]
-        {
+        let rectangles = [(5.3, 30.8, 4.6, 22.1), (7.0, 29.0, 6.0, 20.0), (9.5, 9.9, 3.2, 27.7)];
+        for (left, right, top, bottom) in rectangles {
             let corners =
                 vec![point(left, top), point(right, top), point(right, bottom), point(left, bottom)];
             let view = draw(&mesh(corners, &[[0, 1, 2], [0, 2, 3]]), &camera, &flat(samples));

@@ -210,12 +210,11 @@ mod tests {
     use super::*;
 
     fn cube() -> Patch {
-        let vertices = (0..8)
-            .map(|i| {
-                let p = Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) - 0.5;
-                Vertex { rest: p, posed: p, parts: [0.1; PARTS] }
-            })
-            .collect();
+        let vertex = |i: u32| {
+            let p = Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) - 0.5;
+            Vertex { rest: p, posed: p, parts: [0.1; PARTS] }
+        };
+        let vertices = (0..8).map(vertex).collect();
         let faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
         Patch { vertices, faces: faces.map(|f| f.to_vec()).to_vec() }
     }

@@ -190,10 +190,9 @@ fn rectified_points_keep_their_distance_from_the_axis() {
             assert!(seen > 300 && apart <= edges, "{placed_share}, view {view}: {apart} of {seen} points");
         }
         // The person's depth, and no lean: the middle of the body is above the feet.
-        let points: Vec<DVec3> = (0..2 * 128 * 128)
-            .filter(|pixel| upright.valid[*pixel] > 0.5)
-            .map(|pixel| around.apply(Vec3::from_slice(&upright.points[3 * pixel..3 * pixel + 3]).as_dvec3()))
-            .collect();
+        let pixels = (0..2 * 128 * 128).filter(|pixel| upright.valid[*pixel] > 0.5);
+        let points = pixels.map(|pixel| Vec3::from_slice(&upright.points[3 * pixel..3 * pixel + 3]));
+        let points: Vec<DVec3> = points.map(|point| around.apply(point.as_dvec3())).collect();
         let slice = |low: f64, high: f64| {
             let z = || points.iter().filter(|p| (low..high).contains(&p.y)).map(|p| p.z);
             0.5 * (z().fold(f64::MAX, f64::min) + z().fold(f64::MIN, f64::max))
