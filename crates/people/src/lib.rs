@@ -3,7 +3,6 @@
 
 pub mod avatars;
 mod figure;
-mod joint_names;
 pub mod makehuman;
 mod math;
 mod pattern;

@@ -7,9 +7,8 @@ use rand::Rng;
 use snapsnap_base::{FileError, file, folder, quoted};
 
 use crate::figure::{Pose, sign};
-use crate::joint_names::{Name, known, need};
 use crate::math::{rotate_x, rotate_y, rotate_z};
-use crate::skeleton::hanging;
+use crate::skeleton::{Name, hanging, known, need};
 
 /// Largest file, in bytes.
 const MAX_BYTES: u64 = 64 << 20;

@@ -92,11 +92,10 @@ impl Folder {
                 drawn: None,
             },
         };
-        let (split, subject) = folder
-            .splits()
-            .into_iter()
-            .find_map(|split| Some((split, folder.subjects(split).ok()?.into_iter().next()?)))
-            .ok_or_else(|| foreign("no subject lies in img, train/img, val/img or test/img"))?;
+        let first = |split| Some((split, folder.subjects(split).ok()?.into_iter().next()?));
+        let found = folder.splits().into_iter().find_map(first);
+        let missing = || foreign("no subject lies in img, train/img, val/img or test/img");
+        let (split, subject) = found.ok_or_else(missing)?;
         let first = folder.person(split, &subject).picture_path(0);
         let [width, _] = picture::size(&first, None)?;
         folder.description.resolution = width;
