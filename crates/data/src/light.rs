@@ -3,8 +3,7 @@
 use glam::Vec3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
-use snapsnap_base::config::outside;
-use snapsnap_base::random::stream;
+use snapsnap_base::{config, random};
 use snapsnap_mesh::view::{Lamp, Light, Surroundings};
 
 /// How a subject is lit.
@@ -59,7 +58,7 @@ impl LightConfig {
     /// The first invalid key, and why it is invalid.
     pub(crate) fn problem(&self) -> Option<(&'static str, String)> {
         let [low, high] = self.contrast.map(f64::from);
-        outside([
+        config::outside([
             ("lamps", self.lamps as f64, 1.0..=8.0),
             ("contrast", low, 1.05..=100.0),
             ("contrast", high, low.max(1.05)..=100.0),
@@ -69,7 +68,7 @@ impl LightConfig {
 
     /// The light of a subject, for a camera that looks along −z.
     pub(crate) fn draw(&self, identity: &str) -> Light {
-        let random = &mut stream(&format!("light/{}/{identity}", self.seed));
+        let random = &mut random::stream(&format!("light/{}/{identity}", self.seed));
         if self.kind == Kind::Even {
             return Light::default();
         }

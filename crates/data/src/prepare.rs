@@ -13,9 +13,8 @@ use crate::dataset::{
     Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split,
 };
 use crate::light::LightConfig;
-use snapsnap_base::FileError;
 use snapsnap_base::config::{Schema, outside};
-use snapsnap_base::random::stream;
+use snapsnap_base::{FileError, random};
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_mesh::view::{Renderer, ViewOptions};
 
@@ -141,8 +140,8 @@ impl DataConfig {
     /// The cameras of a subject that faces `yaw_degrees` (docs/method.md, "Cameras"). `name` decides their random
     /// deviations.
     pub fn cameras(&self, yaw_degrees: f64, name: &str) -> Vec<Camera> {
-        let mut random = stream(&format!("cameras/{name}"));
-        let mut shifts = stream(&format!("shifts/{name}"));
+        let mut random = random::stream(&format!("cameras/{name}"));
+        let mut shifts = random::stream(&format!("shifts/{name}"));
         if self.views.arrangement == Arrangement::Groups {
             return (0..self.views.count / 4)
                 .flat_map(|_| self.group(yaw_degrees, &mut random, &mut shifts))
@@ -150,14 +149,13 @@ impl DataConfig {
         }
         let mut rig = self.orbit(yaw_degrees);
         self.jitter.rig.apply(&mut rig, &mut random);
-        (0..self.views.count)
-            .map(|view| {
-                let mut orbit = rig;
-                orbit.yaw_degrees += view as f64 * 360.0 / self.views.count as f64;
-                self.jitter.view.apply(&mut orbit, &mut random);
-                self.jitter.rig.plus(&self.jitter.view).shifted(self.camera(orbit), &mut shifts)
-            })
-            .collect()
+        let camera = |view: usize| {
+            let mut orbit = rig;
+            orbit.yaw_degrees += view as f64 * 360.0 / self.views.count as f64;
+            self.jitter.view.apply(&mut orbit, &mut random);
+            self.jitter.rig.plus(&self.jitter.view).shifted(self.camera(orbit), &mut shifts)
+        };
+        (0..self.views.count).map(camera).collect()
     }
 
     /// The orbit of a camera without deviations.
@@ -309,7 +307,8 @@ mod tests {
 
     #[test]
     fn jitter_stays_in_its_ranges_and_follows_the_name() {
-        let jitter = Jitter {
+        let mut config = DataConfig::default();
+        config.jitter.view = Jitter {
             yaw: 5.0,
             pitch: 4.0,
             roll: 3.0,
@@ -318,8 +317,6 @@ mod tests {
             look_at: 0.05,
             ..Jitter::default()
         };
-        let mut config = DataConfig::default();
-        config.jitter.view = jitter;
         let cameras = |name: &str| config.cameras(0.0, name);
         assert_eq!(cameras("a"), cameras("a"));
         assert_ne!(cameras("a"), cameras("b"));

@@ -9,8 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::Split;
-use snapsnap_base::FileError;
-use snapsnap_base::folder::entries;
+use snapsnap_base::{FileError, folder};
 use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::{Mesh, MeshError};
 
@@ -169,7 +168,7 @@ fn search(
     if !visited.insert(folder.canonicalize().unwrap_or_else(|_| folder.to_owned())) {
         return Ok(());
     }
-    let entries = entries(folder)?;
+    let entries = folder::entries(folder)?;
     let is_scan = |path: &Path| {
         let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
         path.is_file() && extension.is_some_and(|e| import::EXTENSIONS.contains(&e.as_str()))

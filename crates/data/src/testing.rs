@@ -6,7 +6,7 @@ use glam::Vec3;
 use tempfile::TempDir;
 
 use crate::dataset::{Folder, Layout, Split};
-use crate::prepare::DataConfig;
+use crate::prepare::{DataConfig, ViewsConfig};
 use crate::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::{Face, Material, Mesh};
 use snapsnap_people::{Detail, synth};
@@ -79,12 +79,8 @@ pub fn data_set(
     high_resolution: bool,
     subjects: usize,
 ) -> (TempDir, Arc<Folder>) {
-    let mut config = DataConfig::default();
-    config.views.layout = layout;
-    config.views.resolution = resolution;
-    config.views.count = views;
-    config.views.high_resolution = high_resolution;
-    made(&config, mesh, subjects)
+    let views = ViewsConfig { layout, resolution, count: views, high_resolution, ..ViewsConfig::default() };
+    made(&DataConfig { views, ..DataConfig::default() }, mesh, subjects)
 }
 
 /// A data set of this config, with `subjects` copies of `mesh` in the split train.

@@ -127,15 +127,14 @@ impl Mesh {
         let bits = |v: Vec3| v.to_array().map(|x| if x == 0.0 { 0 } else { x.to_bits() });
         let mut rows = HashMap::with_capacity(self.positions.len());
         let mut kept = Vec::new();
-        let places: Vec<u32> = (0..self.positions.len())
-            .map(|row| {
-                let color = self.colors.get(row).map(|color| bits(*color));
-                *rows.entry((bits(self.positions[row]), color)).or_insert_with(|| {
-                    kept.push(row);
-                    kept.len() as u32 - 1
-                })
+        let place = |row: usize| {
+            let color = self.colors.get(row).map(|color| bits(*color));
+            *rows.entry((bits(self.positions[row]), color)).or_insert_with(|| {
+                kept.push(row);
+                kept.len() as u32 - 1
             })
-            .collect();
+        };
+        let places: Vec<u32> = (0..self.positions.len()).map(place).collect();
         self.positions = kept.iter().map(|row| self.positions[*row]).collect();
         if !self.colors.is_empty() {
             self.colors = kept.iter().map(|row| self.colors[*row]).collect();

@@ -45,21 +45,16 @@ pub fn photograph(path: &Path, bytes: Option<&[u8]>) -> Result<DynamicImage, Fil
     guarded(path, || decode_from(path, file, MAX_BYTES, true, true))
 }
 
-/// Width and height of the picture in `path`, without regard to its EXIF data.
+/// Width and height of the picture in `path`, or in `bytes` if there are any, without regard to its EXIF data.
 ///
 /// # Errors
 /// [`FileError`] for a file that cannot be read or is no picture.
-pub fn size(path: &Path) -> Result<[u32; 2], FileError> {
+pub fn size(path: &Path, bytes: Option<&[u8]>) -> Result<[u32; 2], FileError> {
+    if let Some(bytes) = bytes {
+        return guarded(path, || size_from(path, Cursor::new(bytes)));
+    }
     let file = BufReader::new(file::open(path).map_err(FileError::read(path))?);
     guarded(path, || size_from(path, file))
-}
-
-/// Width and height of the picture in `bytes`. Errors name `path`, the file that contains it.
-///
-/// # Errors
-/// As [`size`].
-pub fn size_of_bytes(path: &Path, bytes: &[u8]) -> Result<[u32; 2], FileError> {
-    guarded(path, || size_from(path, Cursor::new(bytes)))
 }
 
 fn size_from(path: &Path, mut source: impl BufRead + Seek) -> Result<[u32; 2], FileError> {

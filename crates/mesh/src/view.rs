@@ -138,13 +138,12 @@ impl<'a> Renderer<'a> {
         let (width, height) = (camera.width as usize, camera.height as usize);
         let corners: Vec<DVec3> =
             self.mesh.positions.par_iter().map(|p| camera.world_to_camera.apply(p.as_dvec3())).collect();
+        let projected = |(row, face): (usize, &Face)| {
+            let corners = face.positions.map(|row| corners[row as usize]);
+            triangle(corners, row, self.holes(face).is_some(), camera)
+        };
         let faces = self.mesh.faces.par_iter().enumerate();
-        let triangles: Vec<Triangle> = faces
-            .filter_map(|(row, face)| {
-                let triangle = triangle(face.positions.map(|row| corners[row as usize]), row, camera)?;
-                Some(Triangle { has_holes: self.holes(face).is_some(), ..triangle })
-            })
-            .collect();
+        let triangles: Vec<Triangle> = faces.filter_map(projected).collect();
         let mut lists: Vec<Vec<u32>> = vec![Vec::new(); height.div_ceil(BAND)];
         for (index, t) in (0..).zip(&triangles) {
             let lists = &mut lists[t.rows[0] / BAND..=t.rows[1] / BAND];
@@ -198,7 +197,7 @@ impl<'a> Renderer<'a> {
 }
 
 /// Projects a triangle; `None` if it is invisible.
-fn triangle(corners: [DVec3; 3], face: usize, camera: &Camera) -> Option<Triangle> {
+fn triangle(corners: [DVec3; 3], face: usize, has_holes: bool, camera: &Camera) -> Option<Triangle> {
     if corners.iter().any(|c| c.z < NEAR) {
         return None;
     }
@@ -234,15 +233,8 @@ fn triangle(corners: [DVec3; 3], face: usize, camera: &Camera) -> Option<Triangl
     let (f, c) = (camera.focal, camera.principal_point);
     let (x, y) = (n.x / f.x, n.y / f.y);
     let plane = DVec3::new(x, y, n.z - x * c.x - y * c.y) / distance;
-    Some(Triangle {
-        corners: rounded,
-        plane,
-        columns,
-        rows,
-        face: face as u32,
-        is_front: distance < 0.0,
-        has_holes: false,
-    })
+    let (face, is_front) = (face as u32, distance < 0.0);
+    Some(Triangle { corners: rounded, plane, columns, rows, face, is_front, has_holes })
 }
 
 /// Positions of the samples within a pixel, in 1/[`SUBPIXELS`]. The last one is the centre, used only for depth.

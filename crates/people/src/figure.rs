@@ -285,11 +285,8 @@ impl Figure {
         let (pelvis_frame, chest_frame) = (pose.trunk_frame(0.0), pose.trunk_frame(1.0));
         let pelvis = Bone::stand(Vec3::ZERO, pelvis_frame, 0.095 * h);
         let chest = Bone::stand(pelvis.end, chest_frame, 0.215 * h);
-        let neck = Bone::stand(
-            chest.end,
-            chest_frame * rotate_x(0.4 * pose.head[0] + pose.spine[2] + 8.0),
-            0.045 * h,
-        );
+        let neck_frame = chest_frame * rotate_x(0.4 * pose.head[0] + pose.spine[2] + 8.0);
+        let neck = Bone::stand(chest.end, neck_frame, 0.045 * h);
         let head = Bone::stand(neck.end, pose.head_frame(1.0), 0.128 * h * build.head);
 
         let breadth = h * build.shoulders * (0.09 + 0.015 * build.sex);

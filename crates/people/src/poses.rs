@@ -4,13 +4,11 @@ use std::path::Path;
 
 use glam::{Mat3, Vec3};
 use rand::Rng;
-use snapsnap_base::{FileError, file, quoted};
+use snapsnap_base::{FileError, file, folder, quoted};
 
 use crate::figure::{Pose, sign};
-use crate::joint_names::{Name, known, need};
 use crate::math::{rotate_x, rotate_y, rotate_z};
-use crate::skeleton::hanging;
-use snapsnap_base::folder::with_ending;
+use crate::skeleton::{Name, hanging, known, need};
 
 /// Largest file, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
@@ -39,7 +37,7 @@ impl Poses {
     /// [`FileError`] for a folder or a file that cannot be read.
     pub fn open(folder: &Path) -> Result<Option<Self>, FileError> {
         let mut poses = Vec::new();
-        for path in with_ending(folder, "bvh")? {
+        for path in folder::with_ending(folder, "bvh")? {
             poses.extend(read(&path)?.into_iter().filter(Pose::stands));
         }
         Ok((!poses.is_empty()).then_some(Self { poses }))
@@ -136,11 +134,8 @@ fn parse(text: &str) -> Result<Vec<Pose>, String> {
             }
             "CHANNELS" => {
                 let row = own.ok_or("has channels outside of a joint")?;
-                let count: usize = words
-                    .next()
-                    .and_then(|word| word.parse().ok())
-                    .filter(|count| *count <= 6)
-                    .ok_or("has a joint without a number of channels up to 6")?;
+                let count = words.next().and_then(|word| word.parse::<usize>().ok()).filter(|n| *n <= 6);
+                let count = count.ok_or("has a joint without a number of channels up to 6")?;
                 let channels: Option<Vec<Channel>> = (0..count).map(|_| channel(words.next()?)).collect();
                 joints[row].channels = channels.ok_or("has a joint with unknown channels")?;
             }

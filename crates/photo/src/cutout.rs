@@ -241,9 +241,8 @@ mod tests {
     /// Pictures of black and one dark colour are labels. Others keep their brightness.
     #[test]
     fn labels_are_masks() {
-        for (values, expected) in
-            [([0, 1, 1], [0, 255, 255]), ([0, 40, 60], [0, 40, 60]), ([0, 200, 0], [0, 200, 0])]
-        {
+        let masks = [([0, 1, 1], [0, 255, 255]), ([0, 40, 60], [0, 40, 60]), ([0, 200, 0], [0, 200, 0])];
+        for (values, expected) in masks {
             let mask = GrayImage::from_raw(3, 1, values.to_vec()).expect("three pixels");
             assert_eq!(grey(&mask.into()).as_raw(), &expected, "{values:?}");
         }

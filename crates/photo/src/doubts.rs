@@ -1,7 +1,5 @@
 //! Signs that two photographs do not show the front and the back of one person who stands upright.
 
-use std::fmt;
-
 use glam::Vec2;
 use image::{GrayImage, RgbImage};
 use serde::Serialize;
@@ -30,7 +28,8 @@ const COLUMNS: i64 = 2 * GRID as i64;
 const EQUAL: f32 = 2.0;
 
 /// A sign that photographs are unsuitable, and the photographs that it concerns.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, thiserror::Error)]
+#[error("{}: {sign}", .photographs.join(" and "))]
 pub struct Doubt {
     /// Files or other names of the photographs.
     pub photographs: Vec<String>,
@@ -40,39 +39,60 @@ pub struct Doubt {
 }
 
 /// What is wrong with photographs.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, thiserror::Error)]
 #[serde(tag = "sign", rename_all = "kebab-case")]
 #[allow(missing_docs, reason = "the names say it")]
 pub enum Sign {
     /// The mask touches more borders of the picture than a person does.
+    #[error("the mask touches {borders} borders of the picture: is it inverted? The person must be white")]
     TouchesBorders { borders: usize },
     /// The person is wider than high: width and height in pixels.
+    #[error(
+        "the person is wider than high ({}×{} pixels): the person should stand upright",
+        .size[0], .size[1]
+    )]
     Wide { size: [u32; 2] },
     /// Both are one picture.
+    #[error("this is the same picture twice")]
     Equal,
     /// One is the mirror image of the other.
+    #[error("one is the mirror image of the other")]
     Mirrored,
     /// The first shows the back, the second the front. They were exchanged.
+    #[error("the first shows the back, the second the front: they were exchanged")]
     Swapped,
     /// Both show the same side.
+    #[error("both show the person's {}: one must show the front, one the back", side(*.facing))]
     SameSide { facing: Facing },
     /// The photograph shows the person from the side.
+    #[error("the person is seen from the side, not from the front or back")]
     FromTheSide,
     /// Nobody is recognised.
+    #[error("nobody is recognised in the picture")]
     Nobody,
     /// Others are beside the person.
+    #[error("somebody else is in the picture: only one person is taken")]
     Accompanied,
     /// The person lies.
+    #[error("the person does not stand upright")]
     Lies,
     /// The person sits.
+    #[error("the person seems to sit: the person should stand")]
     Sits,
     /// The mask leaves out a part of the torso.
+    #[error("the mask has a hole in the person's torso")]
     Hole,
     /// Parts of the body are outside of the picture.
+    #[error("outside of the picture: {}: the whole person must be visible", list(.parts))]
     Outside { parts: Vec<Part> },
     /// Limbs are elsewhere in the mirrored back.
+    #[error("elsewhere in the back photograph: {}: both need one pose", list(.parts))]
     Moved { parts: Vec<Part> },
     /// The silhouettes do not fit one another: intersection over union.
+    #[error(
+        "the silhouettes of the front and of the mirrored back overlap by {} % only: are they one person in one pose?",
+        (100.0 * *.overlap).round()
+    )]
     LittleOverlap { overlap: f32 },
 }
 
@@ -87,55 +107,9 @@ impl Sign {
     }
 }
 
-impl fmt::Display for Doubt {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.photographs.join(" and "), self.sign)
-    }
-}
-
-impl fmt::Display for Sign {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::TouchesBorders { borders } => write!(
-                f,
-                "the mask touches {borders} borders of the picture: is it inverted? The person must be white"
-            ),
-            Self::Wide { size: [width, height] } => write!(
-                f,
-                "the person is wider than high ({width}×{height} pixels): the person should stand upright"
-            ),
-            Self::Equal => write!(f, "this is the same picture twice"),
-            Self::Mirrored => write!(f, "one is the mirror image of the other"),
-            Self::Swapped => {
-                write!(f, "the first shows the back, the second the front: they were exchanged")
-            }
-            Self::SameSide { facing } => {
-                let side = if *facing == Facing::Front { "front" } else { "back" };
-                write!(f, "both show the person's {side}: one must show the front, one the back")
-            }
-            Self::FromTheSide => write!(f, "the person is seen from the side, not from the front or back"),
-            Self::Nobody => write!(f, "nobody is recognised in the picture"),
-            Self::Accompanied => {
-                write!(f, "somebody else is in the picture: only one person is taken")
-            }
-            Self::Lies => write!(f, "the person does not stand upright"),
-            Self::Sits => write!(f, "the person seems to sit: the person should stand"),
-            Self::Hole => write!(f, "the mask has a hole in the person's torso"),
-            Self::Outside { parts } => {
-                write!(f, "outside of the picture: {}: the whole person must be visible", list(parts))
-            }
-            Self::Moved { parts } => {
-                write!(f, "elsewhere in the back photograph: {}: both need one pose", list(parts))
-            }
-            Self::LittleOverlap { overlap } => {
-                let share = (100.0 * *overlap).round();
-                write!(
-                    f,
-                    "the silhouettes of the front and of the mirrored back overlap by {share} % only: are they one person in one pose?"
-                )
-            }
-        }
-    }
+/// The word for a side.
+fn side(facing: Facing) -> &'static str {
+    if facing == Facing::Front { "front" } else { "back" }
 }
 
 fn list(parts: &[Part]) -> String {

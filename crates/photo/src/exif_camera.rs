@@ -8,7 +8,7 @@ use snapsnap_base::{file, guarded};
 use snapsnap_splat::{Camera, Orbit};
 
 use crate::placing::Mapping;
-use crate::plane_map::PlaneMap;
+use crate::restoration::PlaneMap;
 use crate::source::{Content, Source};
 
 /// Focal lengths of lenses, in millimetres of 35 mm film.

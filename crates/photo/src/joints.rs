@@ -94,20 +94,13 @@ const HAIR: f32 = 1.6;
 const FACE: f32 = 1.2;
 /// Distance beyond the border from which a part is outside of the picture, as a share of the torso's length.
 const BEYOND: f32 = 0.02;
-/// Joints that tell where a limb is, and their largest distances between front and mirrored back, as shares of the
-/// torso's length. Perspective moves feet.
-const LIMBS: [(Part, [(usize, f32); 2]); 4] = [
-    (Part::LeftArm, [(13, 0.5), (15, 0.7)]),
-    (Part::RightArm, [(14, 0.5), (16, 0.7)]),
-    (Part::LeftLeg, [(25, 0.6), (27, 1.0)]),
-    (Part::RightLeg, [(26, 0.6), (28, 1.0)]),
-];
-/// Joints at the ends of the limbs.
-const ENDS: [(Part, [usize; 2]); 4] = [
-    (Part::LeftArm, [15, 19]),
-    (Part::RightArm, [16, 20]),
-    (Part::LeftLeg, [29, 31]),
-    (Part::RightLeg, [30, 32]),
+/// Limbs: joints that tell where a limb is, and their largest distances between front and mirrored back, as shares of the
+/// torso's length (perspective moves feet); and joints at the limb's end.
+const LIMBS: [(Part, [(usize, f32); 2], [usize; 2]); 4] = [
+    (Part::LeftArm, [(13, 0.5), (15, 0.7)], [15, 19]),
+    (Part::RightArm, [(14, 0.5), (16, 0.7)], [16, 20]),
+    (Part::LeftLeg, [(25, 0.6), (27, 1.0)], [29, 31]),
+    (Part::RightLeg, [(26, 0.6), (28, 1.0)], [30, 32]),
 ];
 
 impl Joints {
@@ -180,8 +173,8 @@ impl Joints {
         let nose = self.at(0);
         let crown = nose + CROWN * (nose - self.torso()[0]);
         let head = [crown].into_iter().filter(|at| is_out(*at)).map(|_| Part::Head);
-        let limbs = ENDS.into_iter().filter(|(_, ends)| ends.iter().any(|end| is_out(self.at(*end))));
-        head.chain(limbs.map(|(part, _)| part)).collect()
+        let limbs = LIMBS.iter().filter(|(.., ends)| ends.iter().any(|end| is_out(self.at(*end))));
+        head.chain(limbs.map(|(part, ..)| *part)).collect()
     }
 
     /// Limbs that are elsewhere in the mirrored photograph `back`.
@@ -196,7 +189,7 @@ impl Joints {
             let behind = place(back, *joint) * Vec2::new(-1.0, 1.0);
             seen > SEEN && place(self, *joint).distance(behind) > *most
         };
-        LIMBS.iter().filter(|(_, joints)| joints.iter().any(is_moved)).map(|(part, _)| *part).collect()
+        LIMBS.iter().filter(|(_, joints, _)| joints.iter().any(is_moved)).map(|(part, ..)| *part).collect()
     }
 }
 

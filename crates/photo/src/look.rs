@@ -166,12 +166,7 @@ impl Seen {
     /// Probabilities of the pixels of a part of the picture; `None` outside of the square.
     fn probabilities(&self, part: Rect, [rows, columns]: [usize; 2]) -> Vec<Option<f32>> {
         let step = self.side / SIDE as f32;
-        let at = |first: u32,
-                  length: u32,
-                  count: usize,
-                  corner: f32,
-                  step: f32|
-         -> Vec<Option<(usize, usize, f32)>> {
+        let at = |[first, length]: [u32; 2], count: usize, [corner, step]: [f32; 2]| -> Vec<_> {
             let place =
                 |i: usize| (first as f32 + (i as f32 + 0.5) * length as f32 / count as f32 - corner) / step;
             let tap = |place: f32| {
@@ -181,8 +176,8 @@ impl Seen {
             };
             (0..count).map(|i| tap(place(i))).collect()
         };
-        let down = at(part.y, part.height, rows, self.corner.y, step.y);
-        let across = at(part.x, part.width, columns, self.corner.x, step.x);
+        let down = at([part.y, part.height], rows, [self.corner.y, step.y]);
+        let across = at([part.x, part.width], columns, [self.corner.x, step.x]);
         let value =
             |down: Option<_>, across: Option<_>| Some(interpolate(&self.mask, SIDE, [down?, across?]));
         down.iter().flat_map(|down| across.iter().map(|across| value(*down, *across))).collect()
@@ -255,10 +250,8 @@ impl Small {
         let main = (1..joints_in.len()).max_by_key(rank)?;
         let is_own = |piece: usize| piece == main || joints_in[piece] > 0;
         // Soft pixels belong to no piece; they stay.
-        mask.iter_mut()
-            .zip(&found.of)
-            .filter(|(_, of)| **of > 0 && !is_own(**of as usize))
-            .for_each(|(p, _)| *p = 0.0);
+        let others = mask.iter_mut().zip(&found.of).filter(|(_, of)| **of > 0 && !is_own(**of as usize));
+        others.for_each(|(p, _)| *p = 0.0);
 
         let step = side as f32 / SIDE as f32;
         let place = |x: f32, y: f32| self.scale * (corner.as_vec2() + step * Vec2::new(x, y));

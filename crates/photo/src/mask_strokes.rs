@@ -48,9 +48,8 @@ mod tests {
             _ => Luma([UNTOUCHED]),
         });
         paint(&strokes, &mut mask);
-        for (x, y, expected) in
-            [(1, 3, 200), (38, 3, 10), (15, 3, 255), (25, 3, 255), (15, 16, 0), (25, 16, 0)]
-        {
+        let values = [(1, 3, 200), (38, 3, 10), (15, 3, 255), (25, 3, 255), (15, 16, 0), (25, 16, 0)];
+        for (x, y, expected) in values {
             assert_eq!(mask.get_pixel(x, y)[0], expected, "{x}, {y}");
         }
     }

@@ -369,15 +369,8 @@ mod tests {
     fn the_pose_network_says_where_the_person_is() {
         let wrong = |rgb: &[f32]| -> Vec<f32> {
             let found = network(rgb);
-            (0..SIDE * SIDE)
-                .map(|i| {
-                    if i % SIDE < SIDE / 2 {
-                        0.0
-                    } else {
-                        found[i].max(f32::from(u8::from(i % SIDE > SIDE - 20)))
-                    }
-                })
-                .collect()
+            let right = |i: usize| found[i].max(f32::from(u8::from(i % SIDE > SIDE - 20)));
+            (0..SIDE * SIDE).map(|i| if i % SIDE < SIDE / 2 { 0.0 } else { right(i) }).collect()
         };
         let (_, mask) = cut(photograph(2), &wrong, &pose).expect("a person");
         let is_person = |x: u32, y: u32| (200..400).contains(&x) && (100..700).contains(&y);

@@ -181,13 +181,8 @@ mod tests {
             replace(&mut rgb, &mask(0.0), Background::OfNetwork, |_| is_hair, |_, _| false);
             bright(&rgb)
         };
-        let all = bright(&taken);
-        assert!(
-            all > 300 && with(false) > all / 2 && with(true) < all / 4,
-            "{all} {} {}",
-            with(false),
-            with(true)
-        );
+        let (all, cloth, hair) = (bright(&taken), with(false), with(true));
+        assert!(all > 300 && cloth > all / 2 && hair < all / 4, "{all} {cloth} {hair}");
         let (mut rgb, grown) = (picture(BACKGROUNDS[0].1), mask(5.0));
         replace(&mut rgb, &grown, Background::OfNetwork, |_| false, |_, _| false);
         let left = rgb

@@ -61,6 +61,42 @@ impl Told {
             }
         }
     }
+
+    /// Where the camera of a photograph stood. The networks' person is `height` metres high, the canvas `side` pixels.
+    fn seat(&self, frame: &Frame, side: usize, height: f64) -> Seat {
+        let nominal = Viewpoint::default();
+        let tall = self.height.unwrap_or(USUAL);
+        let focal = frame.shot.focal;
+        let seen = focal.map(|focal| Viewpoint::distance(focal, frame, side));
+        // Turning may shorten the focal length so that the person fits. A told focal length is reported unchanged.
+        let lens = Lens { focal: self.focal.or(focal).unwrap_or_default(), told: self.focal.is_some() };
+        let (distance, distance_by) = match (self.distance, seen) {
+            (Some(distance), _) => (distance * height / tall, DistanceBy::Told),
+            (None, Some(seen)) if DISTANCES.contains(&seen) => (seen, DistanceBy::Lens(lens)),
+            (None, Some(_)) => (nominal.distance, DistanceBy::Misfit(lens)),
+            (None, None) => (nominal.distance, DistanceBy::Unknown),
+        };
+        let pitch = frame.shot.pitch.zip(focal);
+        let pitch = pitch.map(|(pitch, focal)| Viewpoint::elevation(pitch, focal, frame, side));
+        let is_possible = |elevation: &f64| {
+            ELEVATIONS.contains(elevation)
+                && Viewpoint { elevation: *elevation, distance }.stretch() <= TALLEST
+        };
+        let (elevation, elevation_by) = match (self.elevation, pitch.filter(is_possible)) {
+            (Some(elevation), _) => (elevation, ElevationBy::Told),
+            (None, Some(elevation)) => (elevation, ElevationBy::File),
+            (None, None) => (nominal.elevation, ElevationBy::Unknown),
+        };
+        Seat {
+            viewpoint: Viewpoint { elevation, distance },
+            distance: distance * tall / height,
+            distance_by,
+            height: tall,
+            height_assumed: self.height.is_none(),
+            elevation,
+            elevation_by,
+        }
+    }
 }
 
 /// Why cameras and heights have no effect.
@@ -152,44 +188,6 @@ impl fmt::Display for Seat {
             ElevationBy::Unknown => "nominal: unknown",
         };
         write!(f, "; person {height} m high{assumed}), looking down by {elevation:.1}° ({known})")
-    }
-}
-
-impl Told {
-    /// Where the camera of a photograph stood. The networks' person is `height` metres high, the canvas `side` pixels.
-    fn seat(&self, frame: &Frame, side: usize, height: f64) -> Seat {
-        let nominal = Viewpoint::default();
-        let tall = self.height.unwrap_or(USUAL);
-        let focal = frame.shot.focal;
-        let seen = focal.map(|focal| Viewpoint::distance(focal, frame, side));
-        // Turning may shorten the focal length so that the person fits. A told focal length is reported unchanged.
-        let lens = Lens { focal: self.focal.or(focal).unwrap_or_default(), told: self.focal.is_some() };
-        let (distance, distance_by) = match (self.distance, seen) {
-            (Some(distance), _) => (distance * height / tall, DistanceBy::Told),
-            (None, Some(seen)) if DISTANCES.contains(&seen) => (seen, DistanceBy::Lens(lens)),
-            (None, Some(_)) => (nominal.distance, DistanceBy::Misfit(lens)),
-            (None, None) => (nominal.distance, DistanceBy::Unknown),
-        };
-        let pitch = frame.shot.pitch.zip(focal);
-        let pitch = pitch.map(|(pitch, focal)| Viewpoint::elevation(pitch, focal, frame, side));
-        let is_possible = |elevation: &f64| {
-            ELEVATIONS.contains(elevation)
-                && Viewpoint { elevation: *elevation, distance }.stretch() <= TALLEST
-        };
-        let (elevation, elevation_by) = match (self.elevation, pitch.filter(is_possible)) {
-            (Some(elevation), _) => (elevation, ElevationBy::Told),
-            (None, Some(elevation)) => (elevation, ElevationBy::File),
-            (None, None) => (nominal.elevation, ElevationBy::Unknown),
-        };
-        Seat {
-            viewpoint: Viewpoint { elevation, distance },
-            distance: distance * tall / height,
-            distance_by,
-            height: tall,
-            height_assumed: self.height.is_none(),
-            elevation,
-            elevation_by,
-        }
     }
 }
 

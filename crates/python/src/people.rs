@@ -85,7 +85,7 @@ pub fn reconstruct<'py>(
         for (path, pixels, _) in &photographs {
             let size = match pixels {
                 Some((_, width, height, _)) => [*width, *height],
-                None => picture::size(path)?,
+                None => picture::size(path, None)?,
             };
             check_memory(path, size)?;
             decoded.push(pixels.as_ref().map(|pixels| pictures(path, pixels)).transpose()?);

@@ -145,7 +145,7 @@ fn compare(
     lpips: &Result<Lpips, String>,
 ) -> Result<Compared, Failure> {
     let read = |path: &Path| -> Result<Picture, Failure> {
-        let [width, height] = picture::size(path)?;
+        let [width, height] = picture::size(path, None)?;
         let bytes = BYTES * u64::from(width) * u64::from(height);
         memory::check(&format!("{}, {width}×{height},", path.display()), bytes, "make the pictures smaller")?;
         let named = |e| Failure::file(path, e);

@@ -134,7 +134,7 @@ fn read_all(
     for job in jobs {
         let read = unpanicked(|| {
             let paths = job.photographs.as_ref().map_err(|missing| Failure::Input(missing.clone()))?;
-            paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
+            paths.iter().try_for_each(|path| check_memory(path, picture::size(path, None)?))?;
             let sources = [0, 1].map(|i| Source { mask: job.masks[i].as_deref(), ..Source::file(&paths[i]) });
             let mut read = arguments.read(&sources, config, told, &format!("{}: ", job.name))?;
             read.cutouts = Vec::new();

@@ -162,7 +162,7 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let config_path =
         check_paths(arguments, paths, output, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
     target.iter().try_for_each(Target::check_companions)?;
-    paths.iter().try_for_each(|path| check_memory(path, picture::size(path)?))?;
+    paths.iter().try_for_each(|path| check_memory(path, picture::size(path, None)?))?;
     let masks = arguments.masks.as_deref().unwrap_or_default();
     let since = Instant::now();
     let sources =

@@ -111,7 +111,7 @@ impl Studio {
         let upload = body.read(LARGEST)?;
         let job = Job::of(request);
         let name = Path::new("this photograph");
-        check_memory(name, picture::size_of_bytes(name, upload.as_ref())?)?;
+        check_memory(name, picture::size(name, Some(upload.as_ref()))?)?;
         let networks = self.networks(&job, body)?;
         job.step("removing the background");
         let source = Source { content: Content::Bytes(upload.as_ref()), ..Source::file(name) };
@@ -149,7 +149,7 @@ impl Studio {
         let names = ["front photograph", "back photograph"].map(Path::new);
         let photographs = [front, back];
         for (name, bytes) in names.into_iter().zip(photographs) {
-            check_memory(name, picture::size_of_bytes(name, bytes)?)?;
+            check_memory(name, picture::size(name, Some(bytes))?)?;
         }
         let networks = self.networks(&job, body)?;
         // Decoded strokes are larger than an upload: only one job at a time has them.

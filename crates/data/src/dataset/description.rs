@@ -8,8 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::JitterConfig;
 use crate::light::LightConfig;
-use snapsnap_base::config::{self, outside};
-use snapsnap_base::{FileError, file};
+use snapsnap_base::{FileError, config, file};
 
 /// Name of the description's file.
 pub const DESCRIPTION: &str = "dataset.toml";
@@ -133,7 +132,7 @@ impl Description {
     pub(super) fn problem(&self) -> Option<String> {
         let views = ("views", self.views as u64, 1..=MAX_VIEWS as u64);
         let resolution = ("resolution", self.resolution.into(), 1..=MAX_RESOLUTION.into());
-        if let Some((key, message)) = outside([views, resolution]) {
+        if let Some((key, message)) = config::outside([views, resolution]) {
             return Some(format!("`{key}` {message}"));
         }
         if self.arrangement == Arrangement::Groups && !self.views.is_multiple_of(4) {

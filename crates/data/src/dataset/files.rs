@@ -59,12 +59,11 @@ fn straight(view: &View, pixel: usize) -> [u8; 3] {
 
 /// Writes straight colours and coverage.
 pub fn write_rgba(path: &Path, view: &View) -> Result<(), FileError> {
-    let bytes: Vec<u8> = (0..view.alpha.len())
-        .flat_map(|pixel| {
-            let [r, g, b] = straight(view, pixel);
-            [r, g, b, to_byte(view.alpha[pixel])]
-        })
-        .collect();
+    let rgba = |pixel: usize| {
+        let [r, g, b] = straight(view, pixel);
+        [r, g, b, to_byte(view.alpha[pixel])]
+    };
+    let bytes: Vec<u8> = (0..view.alpha.len()).flat_map(rgba).collect();
     write_png(path, &bytes, (view.width, view.height), ExtendedColorType::Rgba8)
 }
 
@@ -116,10 +115,8 @@ fn holds_its_shape(npy: &[u8]) -> bool {
         rest.split_once(')').map(|(shape, _)| shape)
     });
     let numbers = shape.and_then(|shape| {
-        let sides = shape.split(',').map(str::trim).filter(|side| !side.is_empty());
-        sides
-            .map(|side| side.parse::<usize>().ok())
-            .try_fold(1_usize, |product, side| product.checked_mul(side?))
+        let mut sides = shape.split(',').map(str::trim).filter(|side| !side.is_empty());
+        sides.try_fold(1_usize, |product, side| product.checked_mul(side.parse().ok()?))
     });
     numbers.is_some_and(|numbers| numbers <= npy.len() / 4)
 }
@@ -208,14 +205,12 @@ pub fn read_camera(intrinsic: &Stored, extrinsic: &Stored, side: u32) -> Result<
     let e = load(extrinsic, (3, 4))?;
     let row = |row: usize| DVec3::new(e[[row, 0]], e[[row, 1]], e[[row, 2]]);
     let rotation = DMat3::from_cols(row(0), row(1), row(2)).transpose();
+    let translation = DVec3::new(e[[0, 3]], e[[1, 3]], e[[2, 3]]);
     Ok(Camera {
         width: side,
         height: side,
         focal: DVec2::new(k[[0, 0]], k[[1, 1]]),
         principal_point: DVec2::new(k[[0, 2]], k[[1, 2]]),
-        world_to_camera: RigidTransform {
-            rotation,
-            translation: DVec3::new(e[[0, 3]], e[[1, 3]], e[[2, 3]]),
-        },
+        world_to_camera: RigidTransform { rotation, translation },
     })
 }

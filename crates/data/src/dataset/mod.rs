@@ -15,21 +15,21 @@
 //! subject, is renamed last.
 
 mod check;
-mod consistency;
 mod description;
 mod files;
-mod fingerprint;
 #[cfg(test)]
 mod tests;
 mod views;
 mod write;
 
 use std::fmt::Display;
-use std::fs;
+use std::fs::{self, File};
+use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use snapsnap_base::folder::entries;
-use snapsnap_base::{FileError, file};
+use rayon::prelude::*;
+use sha2::{Digest, Sha256};
+use snapsnap_base::{FileError, file, folder};
 
 pub use check::{Checked, check};
 pub use description::DESCRIPTION;
@@ -41,6 +41,11 @@ pub use write::Made;
 
 /// Largest file of a data set that is read.
 const MAX_FILE: u64 = 1 << 30;
+/// Bytes that are read at the beginning and at the end of a file. A PNG and a compressed array end with checksums of
+/// their content.
+const ENDS: u64 = 4096;
+/// Largest depth of files below a split: `img/S/v.png`.
+const MAX_DEPTH: usize = 3;
 
 /// A data-set folder.
 #[derive(Debug, Clone)]
@@ -87,13 +92,12 @@ impl Folder {
                 drawn: None,
             },
         };
-        let (split, subject) = folder
-            .splits()
-            .into_iter()
-            .find_map(|split| Some((split, folder.subjects(split).ok()?.into_iter().next()?)))
-            .ok_or_else(|| foreign("no subject lies in img, train/img, val/img or test/img"))?;
+        let first = |split| Some((split, folder.subjects(split).ok()?.into_iter().next()?));
+        let found = folder.splits().into_iter().find_map(first);
+        let missing = || foreign("no subject lies in img, train/img, val/img or test/img");
+        let (split, subject) = found.ok_or_else(missing)?;
         let first = folder.person(split, &subject).picture_path(0);
-        let [width, _] = picture::size(&first)?;
+        let [width, _] = picture::size(&first, None)?;
         folder.description.resolution = width;
         folder.description.high_resolution = first.with_file_name("0_hr.jpg").is_file();
         if let Some(problem) = folder.description.problem() {
@@ -157,7 +161,7 @@ impl Folder {
     /// [`FileError::Read`] for a missing split.
     pub fn subjects(&self, split: Option<Split>) -> Result<Vec<String>, FileError> {
         let folder = self.split_path(split).join("img");
-        Ok(entries(&folder)?.iter().filter(|path| path.is_dir()).map(|path| name(path)).collect())
+        Ok(folder::entries(&folder)?.iter().filter(|path| path.is_dir()).map(|path| name(path)).collect())
     }
 
     /// Reads a file of the data set.
@@ -183,12 +187,61 @@ impl Folder {
         format!("{view}.{ending}")
     }
 
+    /// A hash of the description and of the files of `splits`: their names, lengths, beginnings and ends.
+    ///
+    /// # Errors
+    /// [`FileError::Read`] for a file or folder that cannot be read.
+    pub fn fingerprint(&self, splits: &[Split]) -> Result<String, FileError> {
+        let mut files = Vec::new();
+        let there = self.splits();
+        for split in splits.iter().map(|split| Some(*split)).filter(|split| there.contains(split)) {
+            list(&self.split_path(split), MAX_DEPTH, &mut files)?;
+        }
+        files.sort_unstable();
+        let hash = |path: &PathBuf| -> Result<_, FileError> {
+            let (length, bytes) = ends(path).map_err(FileError::read(path))?;
+            Ok(Sha256::new().chain_update(length.to_le_bytes()).chain_update(bytes).finalize())
+        };
+        let hashes = files.par_iter().map(hash).collect::<Result<Vec<_>, _>>()?;
+        let mut whole = Sha256::new();
+        whole.update(toml::to_string(&self.description).expect("the description has only TOML types"));
+        for (path, hash) in files.iter().zip(hashes) {
+            let below = path.strip_prefix(&self.root).unwrap_or(path);
+            whole.update(below.to_string_lossy().as_bytes());
+            whole.update(hash);
+        }
+        Ok(format!("{:x}", whole.finalize()))
+    }
+
     fn split_path(&self, split: Option<Split>) -> PathBuf {
         match split {
             Some(split) => self.root.join(split.name()),
             None => self.root.clone(),
         }
     }
+}
+
+/// Adds the files below a folder. Hidden files are unfinished, and left out.
+fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<(), FileError> {
+    for path in folder::entries(folder)? {
+        match path.is_dir() {
+            false => files.push(path),
+            true if depth > 1 => list(&path, depth - 1, files)?,
+            true => {}
+        }
+    }
+    Ok(())
+}
+
+/// Length, beginning and end of a file.
+fn ends(path: &Path) -> io::Result<(u64, Vec<u8>)> {
+    let mut file: File = file::open(path)?;
+    let length = file.metadata()?.len();
+    let mut bytes = Vec::new();
+    (&mut file).take(ENDS).read_to_end(&mut bytes)?;
+    file.seek(SeekFrom::Start(length.saturating_sub(ENDS).max(ENDS)))?;
+    file.take(ENDS).read_to_end(&mut bytes)?;
+    Ok((length, bytes))
 }
 
 /// The last part of a path.

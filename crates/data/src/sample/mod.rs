@@ -4,10 +4,8 @@ mod augment;
 mod four_views;
 mod loader;
 mod photograph_changes;
-mod rectified;
 mod scene;
-mod stage1;
-mod stage2;
+mod stages;
 mod test_set;
 #[cfg(test)]
 mod tests;
@@ -28,11 +26,8 @@ use crate::dataset::{Arrangement, Description, Folder, Layout, Person, Split};
 pub use augment::Augment;
 pub use loader::{Batches, Loader, share};
 pub use photograph_changes::{PhotographChanges, Road};
-use snapsnap_base::FileError;
-use snapsnap_base::config::outside;
-use snapsnap_base::random::stream;
-pub use stage1::{Stage1, Stage1Batch, Stage1Item};
-pub use stage2::{Stage2, Stage2Item};
+use snapsnap_base::{FileError, config, random};
+pub use stages::{Stage1, Stage1Batch, Stage1Item, Stage2, Stage2Item};
 pub use test_set::{Test, TestItem};
 
 /// Least mask value, of 255, at which a pixel counts as the person.
@@ -122,7 +117,7 @@ impl SampleConfig {
             ("random_targets", self.random_targets as f32, 0.0..=64.0),
             ("placed_share", self.placed_share, 0.0..=1.0),
         ];
-        if let Some((key, message)) = outside(ranges) {
+        if let Some((key, message)) = config::outside(ranges) {
             return Some((key.into(), message));
         }
         if self.placed_share > 0.0 && !self.upright {
@@ -241,7 +236,7 @@ impl Source {
     /// The person of a sample and its random stream. As in the published code, people take turns.
     fn person(&self, stage: u32, index: usize) -> (Person<'_>, ChaCha8Rng) {
         let subject = &self.subjects[index % self.subjects.len()];
-        let random = stream(&format!("sample/{stage}/{}/{}/{index}", self.config.seed, self.epoch));
+        let random = random::stream(&format!("sample/{stage}/{}/{}/{index}", self.config.seed, self.epoch));
         (self.folder.person(self.split, subject), random)
     }
 

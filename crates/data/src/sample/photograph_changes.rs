@@ -5,8 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::augment::moved;
 use super::scene::{Scene, behind, photographed};
-use snapsnap_base::config::outside;
-use snapsnap_base::random::stream;
+use snapsnap_base::{config, random};
 use snapsnap_photo::Rect;
 
 /// Canvas side that lengths refer to.
@@ -73,13 +72,13 @@ impl PhotographChanges {
             ));
         }
         let background = self.background.unwrap_or_default().map(|value| ("background", value, 0.0..=1.0));
-        outside([
+        config::outside([
             ("exposure", self.exposure, -4.0..=4.0),
             ("back_exposure", self.back_exposure, -4.0..=4.0),
             ("mask", self.mask, -64.0..=64.0),
             ("cut", self.cut, 0.0..=0.9),
         ])
-        .or_else(|| outside(background))
+        .or_else(|| config::outside(background))
     }
 
     /// The changed photograph number `index` of the person `name`, and its mask.
@@ -98,7 +97,7 @@ impl PhotographChanges {
             let gain = stops.exp2();
             color.iter_mut().for_each(|v| *v = (f32::from(*v) * gain).round().min(255.0) as u8);
         }
-        let mut random = stream(&format!("photograph/{name}/{index}"));
+        let mut random = random::stream(&format!("photograph/{name}/{index}"));
         let plain = self.background.map(|background| background.map(|v| 255.0 * v));
         let scene = self.scene.map(|scene| behind(scene, &color, &mask, &mut random));
         if self.has_background() {

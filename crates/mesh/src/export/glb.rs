@@ -1,14 +1,11 @@
 //! Binary glTF 2.0, all in one file.
 
 use std::collections::HashMap;
-use std::io::{self, Write};
-use std::path::Path;
+use std::io;
 
 use glam::{Vec2, Vec3};
 use gltf::binary::{Glb, Header};
 use serde_json::{Value, json};
-use snapsnap_base::FileError;
-use snapsnap_base::file::write_whole;
 use snapsnap_splat::linear_light;
 
 use super::png;
@@ -21,11 +18,6 @@ const F32: u32 = 5126;
 /// glTF's codes for the use of a buffer view.
 const ATTRIBUTES: u32 = 34962;
 const INDICES: u32 = 34963;
-
-pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
-    let bytes = glb_bytes(mesh).map_err(FileError::write(path))?;
-    write_whole(path, |out| out.write_all(&bytes)).map_err(FileError::write(path))
-}
 
 /// Encodes a binary glTF with one node and one primitive per material. Colours contain the light of the photographs.
 /// Materials are therefore unlit (KHR_materials_unlit), and rough for viewers without this extension.
@@ -67,11 +59,8 @@ pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
 
     let (mut primitives, mut materials, mut images) = (Vec::new(), Vec::new(), Vec::new());
     for (row, material) in mesh.materials.iter().enumerate() {
-        let faces = mesh.faces.iter().zip(&faces);
-        let corners: Vec<u32> = faces
-            .filter(|(face, _)| face.material as usize == row)
-            .flat_map(|(_, corners)| *corners)
-            .collect();
+        let faces = mesh.faces.iter().zip(&faces).filter(|(face, _)| face.material as usize == row);
+        let corners: Vec<u32> = faces.flat_map(|(_, corners)| *corners).collect();
         let [r, g, b] = material.color.to_array().map(linear_light);
         let mut surface =
             json!({ "baseColorFactor": [r, g, b, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0 });

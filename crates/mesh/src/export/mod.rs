@@ -3,18 +3,16 @@
 
 mod glb;
 mod obj;
-mod ply;
 mod print;
 
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{ImageFormat, RgbImage};
-use snapsnap_base::FileError;
-use snapsnap_base::file::write_whole;
+use snapsnap_base::{FileError, file};
 
-use crate::mesh::Mesh;
+use crate::mesh::{Mesh, bytes};
 
 pub use glb::glb_bytes;
 pub use obj::write as write_obj;
@@ -60,17 +58,46 @@ impl Kind {
 /// # Errors
 /// [`FileError::Write`]; [`FileError::Unsuitable`] for a texture in a PLY.
 pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
-    match Kind::named(path) {
-        Some(Kind::Obj) => obj::write(mesh, path),
-        Some(Kind::Ply) => ply::write(mesh, path),
-        Some(Kind::Stl) => {
-            write_whole(path, |out| print::write_stl(mesh, out)).map_err(FileError::write(path))
-        }
-        Some(Kind::ThreeMf) => {
-            write_whole(path, |out| print::write_3mf(mesh, out)).map_err(FileError::write(path))
-        }
-        Some(Kind::Glb) | None => glb::write(mesh, path),
+    let kind = Kind::named(path).unwrap_or(Kind::Glb);
+    if kind == Kind::Obj {
+        return obj::write(mesh, path);
     }
+    if kind == Kind::Ply && mesh.materials.iter().any(|material| material.texture.is_some()) {
+        let message = "a PLY has vertex colours and no texture: write a .glb or .obj";
+        return Err(FileError::unsuitable(path, message));
+    }
+    file::write_whole(path, |out| match kind {
+        Kind::Ply => write_ply(mesh, out),
+        Kind::Stl => print::write_stl(mesh, out),
+        Kind::ThreeMf => print::write_3mf(mesh, out),
+        Kind::Glb | Kind::Obj => out.write_all(&glb_bytes(mesh)?),
+    })
+    .map_err(FileError::write(path))
+}
+
+/// Writes a binary PLY of triangles with vertex colours.
+fn write_ply(mesh: &Mesh, out: &mut impl Write) -> io::Result<()> {
+    writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}", mesh.positions.len())?;
+    ["x", "y", "z"].iter().try_for_each(|axis| writeln!(out, "property float {axis}"))?;
+    if !mesh.colors.is_empty() {
+        write!(out, "property uchar red\nproperty uchar green\nproperty uchar blue\n")?;
+    }
+    let faces = mesh.faces.len();
+    writeln!(out, "element face {faces}\nproperty list uchar int vertex_indices\nend_header")?;
+    for (row, p) in mesh.positions.iter().enumerate() {
+        p.to_array().iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
+        if let Some(color) = mesh.colors.get(row) {
+            out.write_all(&bytes(*color))?;
+        }
+    }
+    for face in &mesh.faces {
+        out.write_all(&[3])?;
+        for row in face.positions {
+            let row = i32::try_from(row).map_err(io::Error::other)?;
+            out.write_all(&row.to_le_bytes())?;
+        }
+    }
+    Ok(())
 }
 
 /// Additional files that [`write()`] writes for a mesh with one texture, or without one.

@@ -57,12 +57,11 @@ pub fn atlas(mesh: &Mesh, side: usize) -> Result<Atlas, String> {
     let axes: Vec<usize> = (0..mesh.faces.len()).map(|face| axis(mesh, face)).collect();
     let triangles: Vec<[u32; 3]> = mesh.faces.iter().map(|face| face.positions).collect();
     let across = across(&mesh.positions, &triangles).ok_or("the surface is not closed")?;
-    let area: f32 = (0..axes.len())
-        .map(|face| {
-            let [a, b, c] = flat(mesh, face, axes[face], 1.0);
-            0.5 * (b - a).perp_dot(c - a).abs()
-        })
-        .sum();
+    let area = |face: usize| {
+        let [a, b, c] = flat(mesh, face, axes[face], 1.0);
+        0.5 * (b - a).perp_dot(c - a).abs()
+    };
+    let area: f32 = (0..axes.len()).map(area).sum();
     let mut texel = (area / (FILLED * (side * side) as f32)).sqrt();
     let (mut fewest, mut vain) = (usize::MAX, 0);
     for _ in 0..TRIES {

@@ -75,12 +75,11 @@ impl Manifold {
     fn part_edges(&mut self) {
         let mut there = HashSet::new();
         let corners = self.triangles.as_flattened();
-        let mut again: Vec<usize> = (0..corners.len())
-            .filter(|side| {
-                let (from, to) = (corners[*side], corners[around(*side, 1)]);
-                from < to && !there.insert((from, to))
-            })
-            .collect();
+        let is_again = |side: &usize| {
+            let (from, to) = (corners[*side], corners[around(*side, 1)]);
+            from < to && !there.insert((from, to))
+        };
+        let mut again: Vec<usize> = (0..corners.len()).filter(is_again).collect();
         while let Some(side) = again.pop() {
             let pair = [side, self.across[side]];
             let mut normal = Vec3::ZERO;

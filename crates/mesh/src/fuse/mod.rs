@@ -3,13 +3,11 @@
 //! kept.
 
 mod atlas;
-mod color;
 mod grid;
 mod manifold;
-mod parts;
 mod simplify;
 mod stray;
-mod tunnels;
+mod topology;
 mod views;
 
 use std::collections::HashMap;
@@ -24,9 +22,8 @@ use snapsnap_splat::scene::Loaded;
 use snapsnap_splat::{Gaussians, SplatError};
 
 use crate::mesh::{Mesh, bytes};
-use color::Mean;
 use grid::{Grid, Kept};
-use views::{View, host};
+use views::{Mean, View, host};
 
 pub use stray::on_body;
 
@@ -181,7 +178,7 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     let faces = triangles.len();
     let mut mesh = Mesh::colored(positions, Vec::new(), triangles);
     stage("colours");
-    mesh.colors = color::colors(&mesh, &views, cell);
+    mesh.colors = views::colors(&mesh, &views, cell);
     stage("reducing");
     let mut mesh = simplify::simplify(mesh, options.faces)?;
     if options.texture > 0 {
@@ -210,7 +207,7 @@ fn textured(mesh: &mut Mesh, scene: &Loaded, radius: f64, side: usize, cell: f32
     for camera in views::cameras(&views::RINGS, radius, TEXTURE_SIDE) {
         let view = View::new(scene, camera, radius, u64::MAX)?;
         means.par_iter_mut().zip(&atlas.texels).for_each(|(mean, texel)| {
-            mean.add(&view, texel.place, texel.normal, color::REACH * cell);
+            mean.add(&view, texel.place, texel.normal, views::REACH * cell);
         });
     }
     let mut texture = vec![None; side * side];

@@ -228,21 +228,15 @@ impl File<'_> {
         }
         let texture = base(&primitive.material()).1;
         let texcoords = primitive.get(&gltf::Semantic::TexCoords(set));
-        let texcoords: Vec<Vec2> = texcoords
-            .into_iter()
-            .flat_map(|rows| self.numbers::<2>(&rows))
-            .map(|at| texture.as_ref().map_or(at.into(), |texture| transformed(texture, at.into())))
-            // The origin of glTF's texture coordinates is at the top.
-            .map(|at| Vec2::new(at.x, 1.0 - at.y))
-            .collect();
+        let texcoords = texcoords.into_iter().flat_map(|rows| self.numbers::<2>(&rows)).map(Vec2::from_array);
+        let texcoords = texcoords.map(|at| texture.as_ref().map_or(at, |texture| transformed(texture, at)));
+        // The origin of glTF's texture coordinates is at the top.
+        let texcoords: Vec<Vec2> = texcoords.map(|at| Vec2::new(at.x, 1.0 - at.y)).collect();
         if texture.is_some() && texcoords.is_empty() && count > 0 {
             return Err(self.wrong(format!("a primitive has a texture, but no `TEXCOORD_{set}`")));
         }
-        let colors: Vec<Vec3> = reader
-            .read_colors(0)
-            .into_iter()
-            .flat_map(|c| c.into_rgb_f32().map(|c| Vec3::from_array(c).map(shown)))
-            .collect();
+        let colors = reader.read_colors(0).into_iter().flat_map(|colors| colors.into_rgb_f32());
+        let colors: Vec<Vec3> = colors.map(|color| Vec3::from_array(color).map(shown)).collect();
         let indices: Option<Vec<u32>> = reader.read_indices().map(|indices| indices.into_u32().collect());
 
         for (found, what) in [(texcoords.len(), "texture coordinates"), (colors.len(), "colours")] {
@@ -327,10 +321,9 @@ impl File<'_> {
         }
         let size = accessor.size();
         let stride = view.stride().unwrap_or(size);
-        let end = accessor
-            .count()
-            .checked_sub(1)
-            .and_then(|last| last.checked_mul(stride)?.checked_add(size)?.checked_add(accessor.offset()));
+        let last = accessor.count().checked_sub(1);
+        let end = |last: usize| last.checked_mul(stride)?.checked_add(size)?.checked_add(accessor.offset());
+        let end = last.and_then(end);
         let inside = view.offset().checked_add(view.length()).is_some_and(|end| end <= self.blob.len());
         if stride < size || !inside || end.is_none_or(|end| end > view.length()) {
             let count = accessor.count();

@@ -15,9 +15,7 @@ use std::sync::Arc;
 
 use glam::{Vec2, Vec3};
 use image::{DynamicImage, RgbImage};
-use snapsnap_base::file::folder_of;
-use snapsnap_base::folder::entries;
-use snapsnap_base::{FileError, guarded, quoted};
+use snapsnap_base::{FileError, file, folder, guarded, quoted};
 
 use crate::mesh::Mesh;
 use crate::picture::decode;
@@ -168,13 +166,13 @@ impl Textures<PathBuf> {
 /// The file to which `owner` refers as `name`: relative to the folder of `owner`, or else the file name alone in this
 /// folder, since scans contain paths of other machines.
 fn beside(owner: &Path, kind: &str, name: &str) -> Result<PathBuf, FileError> {
-    let folder = folder_of(owner);
+    let folder = file::folder_of(owner);
     let slashes = name.replace('\\', "/");
     let last = slashes.rsplit('/').next().unwrap_or_default();
     let mut paths = [name, &slashes, last].into_iter().map(|name| folder.join(name));
     // Other systems do not distinguish capitals.
     let alike = || {
-        let mut names = entries(folder).ok()?.into_iter();
+        let mut names = folder::entries(folder).ok()?.into_iter();
         names.find(|path| path.file_name().is_some_and(|found| found.eq_ignore_ascii_case(last)))
     };
     paths

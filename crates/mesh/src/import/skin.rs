@@ -30,12 +30,8 @@ impl File<'_> {
             let count = accessor.as_ref().map(gltf::Accessor::count);
             self.check("inverse bind matrices", accessor, &[DataType::F32], &[Dimensions::Mat4])?;
             let reader = skin.reader(|_| Some(&self.blob));
-            let inverse: Vec<Mat4> = reader
-                .read_inverse_bind_matrices()
-                .into_iter()
-                .flatten()
-                .map(|matrix| Mat4::from_cols_array_2d(&matrix))
-                .collect();
+            let inverse = reader.read_inverse_bind_matrices().into_iter().flatten();
+            let inverse: Vec<Mat4> = inverse.map(|matrix| Mat4::from_cols_array_2d(&matrix)).collect();
             let joints = skin.joints().enumerate().map(|(place, joint)| {
                 let row = *rows.get(&joint.index()).ok_or_else(|| {
                     self.wrong(format!("joint {place} of skin {index} is not in the scene"))
@@ -94,9 +90,8 @@ impl File<'_> {
                 return Err(self.wrong(message));
             }
             let mut weights = [(0, 0.0); BONES];
-            for ((to, row), share) in
-                weights.iter_mut().zip(rows).zip(shares).filter(|(_, share)| *share > 0.0)
-            {
+            let parts = weights.iter_mut().zip(rows).zip(shares).filter(|(_, share)| *share > 0.0);
+            for ((to, row), share) in parts {
                 if usize::from(row) >= joints.len() {
                     let message =
                         format!("position {position} refers to joint {row} of a skin of {}", joints.len());
@@ -112,9 +107,6 @@ impl File<'_> {
 
 /// A position after linear blend skinning.
 pub fn moved(p: Vec3, weights: &Weights, joints: &[(u32, Mat4)]) -> Vec3 {
-    weights
-        .iter()
-        .filter(|(_, share)| *share > 0.0)
-        .map(|(row, share)| *share * joints[*row as usize].1.transform_point3(p))
-        .sum()
+    let moving = weights.iter().filter(|(_, share)| *share > 0.0);
+    moving.map(|(row, share)| *share * joints[*row as usize].1.transform_point3(p)).sum()
 }

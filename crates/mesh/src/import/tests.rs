@@ -186,12 +186,8 @@ fn glb_with_nested_nodes_and_a_texture() {
     assert_eq!(texcoords(&mesh, 0), Some([Vec2::ZERO, Vec2::X, Vec2::Y]));
     assert!(mesh.materials[mesh.faces[0].material as usize].texture.is_some());
     let mirrored = changed("\"translation\":[0,0,4]", "\"scale\":[-1,1,1]");
-    let mesh = read(&folder.file("b.glb", mirrored)).expect("reads");
-    assert!(
-        mesh.normals()[0].z > 0.9,
-        "a mirrored node keeps the outside of its faces: {:?}",
-        mesh.normals()
-    );
+    let normals = read(&folder.file("b.glb", mirrored)).expect("reads").normals();
+    assert!(normals[0].z > 0.9, "a mirrored node keeps the outside of its faces: {normals:?}");
 }
 
 /// A PNG with a header of 100,000 × 100,000 pixels.
@@ -286,9 +282,8 @@ fn obj_that_is_cut_short_is_refused() {
     assert_eq!(outcome(&format!("{start}f 1 2 3\nf 1 3 2\n")), Ok(()));
     assert_eq!(outcome(&format!("{start}f 1 2 3\n# End of File")), Ok(()));
     assert_eq!(outcome(&format!("{start}f 1 2 3\n\u{1a}")), Ok(()));
-    for comment in
-        ["# Faces: 2", "# number of triangles: 2", "#Face count 2", "# Vertices: 4", "# 4 vertices"]
-    {
+    let counts = ["# Faces: 2", "# number of triangles: 2", "#Face count 2", "# Vertices: 4", "# 4 vertices"];
+    for comment in counts {
         let error = outcome(&format!("{comment}\n{start}f 1 2 3\n")).expect_err(comment);
         assert!(error.contains("a comment promises"), "{comment}: {error}");
         assert_eq!(outcome(&format!("{comment}\n{start}v 1 1 0\nf 1 2 3\nf 2 4 3\n")), Ok(()), "{comment}");

@@ -112,7 +112,7 @@ fn heic_pictures_are_read_and_damaged_ones_refused() {
     let path = folder.path().join("a.heic");
     let saved = |bytes: &[u8]| fs::write(&path, bytes).expect("writes");
     saved(HEIC);
-    assert_eq!(size(&path).expect("a size"), [96, 64]);
+    assert_eq!(size(&path, None).expect("a size"), [96, 64]);
     let picture = decode(&path, MAX_BYTES).expect("decodes").into_rgb8();
     for (x, y, expected) in [(30, 20, [200, 60, 40]), (80, 50, [40, 90, 200]), (3, 32, [128, 128, 128])] {
         let found = picture.get_pixel(x, y).0;

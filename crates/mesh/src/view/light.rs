@@ -66,12 +66,11 @@ impl Lights {
 impl Default for Lights {
     /// Six weak lights all around, from above, and a stronger one.
     fn default() -> Self {
-        let mut directional: Vec<(Vec3, f32)> = (0..6)
-            .map(|i| {
-                let (sin, cos) = (TAU * i as f32 / 6.0).sin_cos();
-                (Vec3::new(sin, 0.6, cos), 0.25)
-            })
-            .collect();
+        let weak = |i: i32| {
+            let (sin, cos) = (TAU * i as f32 / 6.0).sin_cos();
+            (Vec3::new(sin, 0.6, cos), 0.25)
+        };
+        let mut directional: Vec<(Vec3, f32)> = (0..6).map(weak).collect();
         directional.push((Vec3::new(0.4, 0.8, 0.9), 0.35));
         Self::new(&directional, 0.5)
     }

@@ -39,10 +39,8 @@ impl Pyramid {
         let taps = (long / short).ceil().clamp(1.0, MAX_TAPS);
         let level = (long / taps).max(1.0).log2().min((self.levels.len() - 1) as f32);
         let way = if a > b { right } else { down };
-        let sum: Vec3 = (0..taps as usize)
-            .map(|tap| self.level(at + way * ((tap as f32 + 0.5) / taps - 0.5), level))
-            .sum();
-        sum / taps
+        let tap = |tap: usize| self.level(at + way * ((tap as f32 + 0.5) / taps - 0.5), level);
+        (0..taps as usize).map(tap).sum::<Vec3>() / taps
     }
 
     fn level(&self, at: Vec2, level: f32) -> Vec3 {

@@ -56,13 +56,11 @@ fn sphere(centre: Vec3, radius: f32, levels: usize) -> Mesh {
         }
     }
     for _ in 0..levels {
-        triangles = triangles
-            .iter()
-            .flat_map(|[a, b, c]| {
-                let [ab, bc, ca] = [*a + *b, *b + *c, *c + *a].map(Vec3::normalize);
-                [[*a, ab, ca], [ab, *b, bc], [ca, bc, *c], [ab, bc, ca]]
-            })
-            .collect();
+        let split = |[a, b, c]: [Vec3; 3]| {
+            let [ab, bc, ca] = [a + b, b + c, c + a].map(Vec3::normalize);
+            [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+        };
+        triangles = triangles.into_iter().flat_map(split).collect();
     }
     let positions: Vec<Vec3> = triangles.iter().flatten().map(|p| centre + radius * *p).collect();
     let faces: Vec<[u32; 3]> = (0..triangles.len() as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
@@ -140,9 +138,8 @@ fn coverage_counts_the_samples_between_the_edges() {
         p.extend(2.0).as_vec3()
     };
     for samples in 1..=6 {
-        for (left, right, top, bottom) in
-            [(5.3, 30.8, 4.6, 22.1), (7.0, 29.0, 6.0, 20.0), (9.5, 9.9, 3.2, 27.7)]
-        {
+        let rectangles = [(5.3, 30.8, 4.6, 22.1), (7.0, 29.0, 6.0, 20.0), (9.5, 9.9, 3.2, 27.7)];
+        for (left, right, top, bottom) in rectangles {
             let corners =
                 vec![point(left, top), point(right, top), point(right, bottom), point(left, bottom)];
             let view = draw(&mesh(corners, &[[0, 1, 2], [0, 2, 3]]), &camera, &flat(samples));
@@ -180,12 +177,8 @@ fn neighbouring_triangles_share_no_sample_and_leave_none_out() {
             let inner = |i: u32, shift: f32| if i == 0 || i == n { 0.0 } else { shift };
             let (dx, dy) = (inner(x, random() - 0.5), inner(y, random() - 0.5));
             let z = 2.0 + 0.3 * random();
-            let at = Vec3::new(
-                (x as f32 + 0.7 * dx) / n as f32 - 0.5,
-                (y as f32 + 0.7 * dy) / n as f32 - 0.5,
-                1.0,
-            );
-            positions.push(at * z);
+            let at = Vec2::new(x as f32 + 0.7 * dx, y as f32 + 0.7 * dy) / n as f32 - 0.5;
+            positions.push(at.extend(1.0) * z);
         }
     }
     let faces = cells(n);

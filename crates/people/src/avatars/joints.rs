@@ -5,9 +5,8 @@ use std::collections::HashMap;
 use glam::{Mat3, Quat, Vec3};
 use snapsnap_mesh::import;
 
-use crate::joint_names::{Name, find, known, need};
 use crate::math::rotate_y;
-use crate::skeleton::{Bone, Joint, Rest, hanging};
+use crate::skeleton::{Bone, Joint, Name, Rest, find, hanging, known, need};
 
 /// A part of the body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

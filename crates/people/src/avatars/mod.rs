@@ -10,8 +10,7 @@ use std::path::{Path, PathBuf};
 use glam::{Mat3, Vec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
-use snapsnap_base::FileError;
-use snapsnap_base::random::stream;
+use snapsnap_base::{FileError, folder, random};
 use snapsnap_mesh::import::{self, Rigged};
 use snapsnap_mesh::mesh::Mesh;
 
@@ -21,7 +20,6 @@ use crate::poses::Poses;
 use crate::skeleton::{self, Owner};
 use crate::synth::stand;
 use joints::{Region, Skeleton};
-use snapsnap_base::folder::with_ending;
 
 /// Accepted heights of characters in metres. Other heights mean another unit.
 const HEIGHTS: std::ops::RangeInclusive<f32> = 0.5..=3.0;
@@ -50,7 +48,7 @@ impl Avatars {
     /// # Errors
     /// [`FileError`] if the folder cannot be read, or has no such file.
     pub fn open(folder: &Path, is_chosen: impl Fn(usize) -> bool) -> Result<Self, FileError> {
-        let mut files = with_ending(folder, "glb")?;
+        let mut files = folder::with_ending(folder, "glb")?;
         if files.is_empty() {
             return Err(FileError::unsuitable(folder, "holds no character: no file .glb"));
         }
@@ -71,7 +69,7 @@ impl Avatars {
     /// # Errors
     /// [`FileError`] naming a file that is damaged or no character, and why.
     pub fn person(&self, name: &str, poses: Option<&Poses>) -> Result<Character, FileError> {
-        let mut random = stream(&format!("avatars/{name}"));
+        let mut random = random::stream(&format!("avatars/{name}"));
         let path = &self.files[random.random_range(0..self.files.len())];
         character(path, poses, &mut random)
     }

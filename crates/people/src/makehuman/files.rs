@@ -8,11 +8,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use glam::{Vec2, Vec3};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
-use snapsnap_base::{FileError, file, quoted};
+use snapsnap_base::{FileError, file, folder, quoted};
 
 use super::proxy::{Proxy, wardrobe};
 use crate::poses::Poses;
-use snapsnap_base::folder::with_ending;
 
 /// Metres per unit of MakeHuman's files, a decimetre.
 pub const METRES: f32 = 0.1;
@@ -128,7 +127,7 @@ impl Library {
     /// # Errors
     /// [`FileError::Read`] if it is missing.
     pub fn targets_in(&self, folder: &str) -> Result<Vec<String>, FileError> {
-        let files = with_ending(&self.root.join("targets").join(folder), "target")?;
+        let files = folder::with_ending(&self.root.join("targets").join(folder), "target")?;
         // A target is opened by its stem and the ending in small letters.
         let targets = files.iter().filter(|file| file.extension().is_some_and(|ending| ending == "target"));
         let stems = targets.filter_map(|file| file.file_stem());

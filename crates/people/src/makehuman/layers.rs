@@ -138,39 +138,32 @@ impl Person<'_> {
     }
 
     fn top(&self) -> Piece {
-        self.layer(
-            &[Kind::Trunk, Kind::Arm],
-            |vertex| self.in_top(vertex),
-            |vertex| {
-                let at = self.place(vertex);
-                let share = (at.along / (self.outfit.sleeve * at.length).max(0.05)).clamp(0.0, 1.0);
-                let flare = if at.kind == Kind::Arm { self.outfit.sleeve_flare * share * share } else { 0.0 };
-                // Collars lie close to the neck.
-                let loose = if at.kind == Kind::Trunk {
-                    let collar = self.marks.collar(at.angle);
-                    1.0 - smoothstep(collar - 0.09, collar - 0.02, at.along)
-                } else {
-                    1.0
-                };
-                let off =
-                    0.006 + loose * (0.8 * self.outfit.top_thickness + flare + 1.5 * self.folds(vertex));
-                // The top hangs over the trousers.
-                let over = smoothstep(-0.03, 0.0, self.in_bottom(vertex));
-                off.max(over * (self.off_bottom(vertex) + GAP))
-            },
-        )
+        let thick = |vertex: &Vertex| {
+            let at = self.place(vertex);
+            let share = (at.along / (self.outfit.sleeve * at.length).max(0.05)).clamp(0.0, 1.0);
+            let flare = if at.kind == Kind::Arm { self.outfit.sleeve_flare * share * share } else { 0.0 };
+            // Collars lie close to the neck.
+            let loose = if at.kind == Kind::Trunk {
+                let collar = self.marks.collar(at.angle);
+                1.0 - smoothstep(collar - 0.09, collar - 0.02, at.along)
+            } else {
+                1.0
+            };
+            let off = 0.006 + loose * (0.8 * self.outfit.top_thickness + flare + 1.5 * self.folds(vertex));
+            // The top hangs over the trousers.
+            let over = smoothstep(-0.03, 0.0, self.in_bottom(vertex));
+            off.max(over * (self.off_bottom(vertex) + GAP))
+        };
+        self.layer(&[Kind::Trunk, Kind::Arm], |vertex| self.in_top(vertex), thick)
     }
 
     pub fn shoes(&self) -> Piece {
-        self.layer(
-            &[Kind::Leg, Kind::Foot],
-            |vertex| self.in_shoes(vertex),
-            |vertex| {
-                let at = self.place(vertex);
-                let sole = if at.kind == Kind::Foot && at.angle.abs() > 2.2 { 0.008 } else { 0.0 };
-                0.004 + 0.6 * self.outfit.shoe_thickness + sole
-            },
-        )
+        let thick = |vertex: &Vertex| {
+            let at = self.place(vertex);
+            let sole = if at.kind == Kind::Foot && at.angle.abs() > 2.2 { 0.008 } else { 0.0 };
+            0.004 + 0.6 * self.outfit.shoe_thickness + sole
+        };
+        self.layer(&[Kind::Leg, Kind::Foot], |vertex| self.in_shoes(vertex), thick)
     }
 
     /// Indices of skirts and tails of coats.

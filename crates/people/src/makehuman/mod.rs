@@ -52,14 +52,12 @@ impl Person<'_> {
         if self.worn.shoes.is_none() {
             garments.push(self.shoes());
         }
-        let skirts: Vec<Piece> = self
-            .drapes()
-            .map(|row| {
-                // The tail of a coat hangs over the top, a skirt under it.
-                let is_tail = self.body.parts[row].side == 1;
-                self.skirt(row, &[&skin, &garments[0], &garments[1]][..if is_tail { 3 } else { 2 }])
-            })
-            .collect();
+        let skirt = |row: usize| {
+            // The tail of a coat hangs over the top, a skirt under it.
+            let is_tail = self.body.parts[row].side == 1;
+            self.skirt(row, &[&skin, &garments[0], &garments[1]][..if is_tail { 3 } else { 2 }])
+        };
+        let skirts: Vec<Piece> = self.drapes().map(skirt).collect();
         let mut pieces = vec![self.pressed_skin(skin, &garments)];
         pieces.extend(hair);
         pieces.extend(garments);

@@ -111,11 +111,9 @@ impl Mix {
 fn details(library: &Library, random: &mut impl Rng) -> Result<Vec<(String, f32)>, FileError> {
     let mut found = Vec::new();
     for (folder, most) in DETAILS {
-        let names: Vec<String> = library
-            .targets_in(folder)?
-            .into_iter()
-            .filter(|name| !name.starts_with("r-") && !UNUSUAL.iter().any(|word| name.contains(word)))
-            .collect();
+        let is_usual =
+            |name: &String| !name.starts_with("r-") && !UNUSUAL.iter().any(|word| name.contains(word));
+        let names: Vec<String> = library.targets_in(folder)?.into_iter().filter(is_usual).collect();
         for _ in 0..random.random_range(0..=most) {
             let strength = random.random_range(0.05..STRONGEST);
             if names.is_empty() {

@@ -90,14 +90,11 @@ impl Patch {
     /// One step of Catmull and Clark's subdivision; borders become smooth curves.
     pub fn subdivide(&self) -> Self {
         let count = self.vertices.len();
-        let middles: Vec<Vertex> = self
-            .faces
-            .iter()
-            .map(|face| {
-                let share = 1.0 / face.len() as f32;
-                Vertex::mean(face.iter().map(|row| (share, self.vertices[*row as usize])))
-            })
-            .collect();
+        let middle_of = |face: &Vec<u32>| {
+            let share = 1.0 / face.len() as f32;
+            Vertex::mean(face.iter().map(|row| (share, self.vertices[*row as usize])))
+        };
+        let middles: Vec<Vertex> = self.faces.iter().map(middle_of).collect();
         // Edge numbers by ends; ends and faces of each edge; edges and faces of each vertex.
         let mut rows: HashMap<(u32, u32), usize> = HashMap::new();
         let mut edges: Vec<((u32, u32), Vec<usize>)> = Vec::new();
@@ -213,12 +210,11 @@ mod tests {
     use super::*;
 
     fn cube() -> Patch {
-        let vertices = (0..8)
-            .map(|i| {
-                let p = Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) - 0.5;
-                Vertex { rest: p, posed: p, parts: [0.1; PARTS] }
-            })
-            .collect();
+        let vertex = |i: u32| {
+            let p = Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) - 0.5;
+            Vertex { rest: p, posed: p, parts: [0.1; PARTS] }
+        };
+        let vertices = (0..8).map(vertex).collect();
         let faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
         Patch { vertices, faces: faces.map(|f| f.to_vec()).to_vec() }
     }

@@ -1,8 +1,7 @@
 //! A person of MakeHuman's data in a pose, before it becomes a mesh.
 
 use glam::Vec3;
-use snapsnap_base::FileError;
-use snapsnap_base::random::stream;
+use snapsnap_base::{FileError, random};
 use snapsnap_mesh::mesh::bounds;
 
 use super::files::Library;
@@ -66,7 +65,7 @@ impl<'a> Person<'a> {
         poses: Option<&Poses>,
         detail: Detail,
     ) -> Result<Self, FileError> {
-        let mut random = stream(&format!("makehuman/{name}"));
+        let mut random = random::stream(&format!("makehuman/{name}"));
         let mix = Mix::draw(&mut random);
         let mut build = Build::draw(&mut random);
         let mut pose = Poses::any(poses.or(library.poses.as_ref()), &mut random);
@@ -88,7 +87,7 @@ impl<'a> Person<'a> {
             outfit.top_length = outfit.top_length.max(0.5);
         }
         let is_draped = matches!(outfit.lower, Lower::Skirt { .. }) || outfit.top_length > 1.0;
-        let wardrobe = &mut stream(&format!("makehuman/wardrobe/{name}"));
+        let wardrobe = &mut random::stream(&format!("makehuman/wardrobe/{name}"));
         let worn = Worn::draw(&library.wardrobe, &outfit, mix.sex, is_draped, wardrobe);
         pose.spread_arms(0.5 * outfit.breadth());
 

@@ -5,14 +5,13 @@ use std::sync::Arc;
 
 use glam::{Vec2, Vec3};
 use rand::Rng;
-use snapsnap_base::FileError;
+use snapsnap_base::{FileError, folder};
 use snapsnap_mesh::mesh::pieces;
 
 use super::files::{Face, METRES, numbers, read_obj, read_text, vector, wrong};
 use super::patch::{Patch, Vertex};
 use crate::pattern::Pattern;
 use crate::synth::outfit::{Cut, Outfit};
-use snapsnap_base::folder::{entries, with_ending};
 
 /// Share of people in a suit of the collection, among people without a skirt or a coat.
 const SUITS: f32 = 0.7;
@@ -80,9 +79,9 @@ pub fn wardrobe(root: &Path, vertices: usize) -> Result<Vec<Arc<Proxy>>, FileErr
     let mut proxies = Vec::new();
     for folder in ["clothes", "hair"] {
         let path = root.join(folder);
-        let assets = if path.is_dir() { entries(&path)? } else { Vec::new() };
+        let assets = if path.is_dir() { folder::entries(&path)? } else { Vec::new() };
         for asset in assets.iter().filter(|asset| asset.is_dir()) {
-            for path in with_ending(asset, "mhclo")? {
+            for path in folder::with_ending(asset, "mhclo")? {
                 let mut proxy = Proxy::read(&path, vertices)?;
                 if folder == "hair" {
                     proxy.kind = Kind::Hair;

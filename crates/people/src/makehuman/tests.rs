@@ -116,12 +116,8 @@ fn suits_cover_what_is_below_them() {
         suits.insert(std::sync::Arc::as_ptr(suit));
         let (skin, whole) = (person.skin().patch, person.group("body").subdivide());
         // Arms, waist or calves may be bare.
-        assert!(
-            4 * skin.faces.len() < 3 * whole.faces.len(),
-            "{} of {}",
-            skin.faces.len(),
-            whole.faces.len()
-        );
+        let (left, there) = (skin.faces.len(), whole.faces.len());
+        assert!(4 * left < 3 * there, "{left} of {there}");
         let suit = person.fit(suit).patch;
         let hidden = |v: &Vertex| if v.parts[0] + v.parts[2] + v.parts[3] > 0.9 { 1.0 } else { 0.0 };
         let (through, under) = through(&skin, &suit, hidden);

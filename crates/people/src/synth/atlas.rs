@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use super::body::Body;
 use super::paint::Painter;
+use super::part::Part;
 use super::surface::Surface;
 use crate::Detail;
 use snapsnap_mesh::mesh::{Face, Material, Mesh, bytes};
@@ -38,21 +39,18 @@ struct Chart {
 /// The faces of `surface` as a mesh with a texture; the caller adds the positions.
 pub fn paint(body: &Body, surface: &Surface, painter: &Painter, detail: Detail) -> Mesh {
     // For each face: the part of most corners, and the positions of the corners on the part's chart.
-    let charted: Vec<(usize, [(f32, f32); 3])> = surface
-        .faces
-        .par_iter()
-        .map(|face| {
-            let [a, b, c] = face.map(|row| surface.parts[row as usize]);
-            let owner = usize::from(if b == c { b } else { a });
-            let mut places = face.map(|row| body.parts[owner].chart(surface.positions[row as usize]));
-            let first = places[0].0;
-            for place in &mut places[1..] {
-                // Unwraps the angle to less than half a turn from the first corner.
-                place.0 -= 2.0 * PI * ((place.0 - first) / (2.0 * PI)).round();
-            }
-            (owner, places)
-        })
-        .collect();
+    let chart = |face: &[u32; 3]| {
+        let [a, b, c] = face.map(|row| surface.parts[row as usize]);
+        let owner = usize::from(if b == c { b } else { a });
+        let mut places = face.map(|row| body.parts[owner].chart(surface.positions[row as usize]));
+        let first = places[0].0;
+        for place in &mut places[1..] {
+            // Unwraps the angle to less than half a turn from the first corner.
+            place.0 -= 2.0 * PI * ((place.0 - first) / (2.0 * PI)).round();
+        }
+        (owner, places)
+    };
+    let charted: Vec<(usize, [(f32, f32); 3])> = surface.faces.par_iter().map(chart).collect();
 
     let mut spans = vec![(f32::INFINITY, f32::NEG_INFINITY); body.parts.len()];
     for (owner, places) in &charted {
@@ -106,24 +104,20 @@ pub fn paint(body: &Body, surface: &Surface, painter: &Painter, detail: Detail) 
 
 /// Shelf packing of charts of `texel` metres per texel, the highest first. Also returns width and height of the picture.
 fn pack(body: &Body, spans: &[(f32, f32)], texel: f32) -> (Vec<Chart>, [usize; 2]) {
-    let mut charts: Vec<Chart> = body
-        .parts
-        .iter()
-        .zip(spans)
-        .map(|(part, (low, high))| {
-            if low > high {
-                return Chart::default();
-            }
-            let around = (2.0 * (PI + OVERLAP) * part.radius / texel).ceil().max(8.0);
-            let rows = ((high - low) / texel).ceil() + 2.0;
-            Chart {
-                origin: [0; 2],
-                size: [around as usize, rows as usize],
-                first: low - texel,
-                step: [2.0 * (PI + OVERLAP) / around, texel],
-            }
-        })
-        .collect();
+    let chart = |(part, (low, high)): (&Part, &(f32, f32))| {
+        if low > high {
+            return Chart::default();
+        }
+        let around = (2.0 * (PI + OVERLAP) * part.radius / texel).ceil().max(8.0);
+        let rows = ((high - low) / texel).ceil() + 2.0;
+        Chart {
+            origin: [0; 2],
+            size: [around as usize, rows as usize],
+            first: low - texel,
+            step: [2.0 * (PI + OVERLAP) / around, texel],
+        }
+    };
+    let mut charts: Vec<Chart> = body.parts.iter().zip(spans).map(chart).collect();
     let widest = charts.iter().map(|c| c.size[0] + GAP).max().unwrap_or(0);
     let width = WIDTH.max(widest);
     let mut order: Vec<usize> = (0..charts.len()).collect();

@@ -24,12 +24,8 @@ fn people_are_closed_and_of_one_piece() {
         let pieces = pieces(mesh.positions.len(), mesh.faces.iter().map(|face| &face.positions[..]));
         assert!(pieces.iter().all(|piece| *piece == 0), "person {index}");
         // Normals point outwards, and the surface has the volume of a person.
-        let volume: f32 = mesh
-            .faces
-            .iter()
-            .map(|f| f.positions.map(|row| mesh.positions[row as usize]))
-            .map(|[a, b, c]| a.dot(b.cross(c)) / 6.0)
-            .sum();
+        let corners = mesh.faces.iter().map(|f| f.positions.map(|row| mesh.positions[row as usize]));
+        let volume: f32 = corners.map(|[a, b, c]| a.dot(b.cross(c)) / 6.0).sum();
         let (low, high) = mesh.bounds();
         assert!((0.03..0.4).contains(&volume), "person {index}: {volume} m³");
         assert!(low.y == 0.0 && (1.4..2.2).contains(&high.y), "person {index}: {low} to {high}");

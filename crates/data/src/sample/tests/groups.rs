@@ -1,7 +1,8 @@
-//! Views in groups.
+//! Views in groups, and second surfaces of side views.
 
 use burn::tensor::{Tensor, TensorData};
 use glam::DVec3;
+use snapsnap_mesh::mesh::Mesh;
 use snapsnap_net::network::View;
 use snapsnap_net::painter::Origin;
 use snapsnap_splat::Gaussians;
@@ -11,7 +12,7 @@ use super::*;
 use crate::Jitter;
 use crate::dataset::check;
 use crate::prepare::DataConfig;
-use crate::testing::made;
+use crate::testing::{made, two_blocks};
 
 /// A data set of one person, in a group of four views whose rig deviates.
 fn group(rig: Jitter) -> (TempDir, Arc<Folder>) {
@@ -22,7 +23,7 @@ fn group(rig: Jitter) -> (TempDir, Arc<Folder>) {
 }
 
 /// Samples that are placed like a user's photographs.
-pub fn placed() -> SampleConfig {
+fn placed() -> SampleConfig {
     SampleConfig {
         placed_share: 1.0,
         upright: true,
@@ -39,7 +40,7 @@ fn first_of_stage2(folder: &Arc<Folder>, config: SampleConfig) -> Stage2Item {
 
 /// Distances in pixels between the points of the view number `view` of a sample and the centres of their pixels in
 /// `camera`. `to_world` transforms the points from the front's frame.
-pub fn distances(
+fn distances(
     (points, valid): (&[f32], &[f32]),
     view: usize,
     to_world: &RigidTransform,
@@ -152,13 +153,9 @@ fn restored_points_lie_on_the_photographed_person() {
         };
         let scaled: Vec<f32> = points.iter().map(|value| restoration.scale as f32 * value).collect();
         // Some points lie on the edge between two pixels.
-        let (wrong, before) = (off(&restored), off(&scaled));
-        assert!(
-            pixels.len() > 300 && wrong * 20 < pixels.len(),
-            "view {view}: {wrong} of {} points",
-            pixels.len()
-        );
-        assert!(before * 2 > pixels.len(), "view {view}: {before} of {} points", pixels.len());
+        let (wrong, before, all) = (off(&restored), off(&scaled), pixels.len());
+        assert!(all > 300 && wrong * 20 < all, "view {view}: {wrong} of {all} points");
+        assert!(before * 2 > all, "view {view}: {before} of {all} points");
     }
 }
 
@@ -193,15 +190,112 @@ fn rectified_points_keep_their_distance_from_the_axis() {
             assert!(seen > 300 && apart <= edges, "{placed_share}, view {view}: {apart} of {seen} points");
         }
         // The person's depth, and no lean: the middle of the body is above the feet.
-        let points: Vec<DVec3> = (0..2 * 128 * 128)
-            .filter(|pixel| upright.valid[*pixel] > 0.5)
-            .map(|pixel| around.apply(Vec3::from_slice(&upright.points[3 * pixel..3 * pixel + 3]).as_dvec3()))
-            .collect();
+        let pixels = (0..2 * 128 * 128).filter(|pixel| upright.valid[*pixel] > 0.5);
+        let points = pixels.map(|pixel| Vec3::from_slice(&upright.points[3 * pixel..3 * pixel + 3]));
+        let points: Vec<DVec3> = points.map(|point| around.apply(point.as_dvec3())).collect();
         let slice = |low: f64, high: f64| {
             let z = || points.iter().filter(|p| (low..high).contains(&p.y)).map(|p| p.z);
             0.5 * (z().fold(f64::MAX, f64::min) + z().fold(f64::MIN, f64::max))
         };
         let lean = slice(1.2, 1.4) - slice(0.3, 0.5);
         assert!(lean.abs() < 0.05, "{placed_share}: {lean} m");
+    }
+}
+
+/// A block with a slab beside its right side, as an arm hangs beside a flank. The slab is smaller than the block.
+fn armed() -> Mesh {
+    let (middle, half) = BLOCK;
+    let beside = Vec3::new(1.5 * half.x, 0.0, 0.0);
+    let share = Vec3::new(0.1, 0.6, 0.4);
+    two_blocks(|p| middle + beside + share * (p - middle))
+}
+
+/// A data set of one person, the armed block, in four views with second depths.
+fn data_of_armed(resolution: u32) -> (TempDir, Arc<Folder>) {
+    let mut config = DataConfig::default();
+    (config.views.count, config.views.resolution, config.views.second_depth) = (4, resolution, true);
+    made(&config, &armed(), 1)
+}
+
+#[test]
+fn samples_carry_the_flank_behind_an_arm() {
+    let side = 128;
+    let (_temporary, folder) = data_of_armed(side as u32);
+    let samples = SampleConfig {
+        second_depth: true,
+        front_within_degrees: 0.0,
+        augment: Augment::none(),
+        ..SampleConfig::default()
+    };
+    let sample = |config: SampleConfig| stage1(&folder, config).sample(0).expect("reads");
+    let plain = sample(samples.clone());
+    let to_world = Camera::orbit_at_yaw_degrees(0.0, side as u32).world_to_camera.inverse();
+    let (middle, half) = BLOCK;
+    // The right camera sees the block's flank behind the arm, the left one the arm's inner side behind the block.
+    for (map, flank) in [(0, middle.x + half.x), (1, middle.x + 1.4 * half.x)] {
+        let second = there(&plain.points, &plain.valid, 4 + map, side);
+        let seen = there(&plain.points, &plain.valid, 2 + map, side).len();
+        assert!((200..seen).contains(&second.len()), "{} of {seen}", second.len());
+        let off = |p: &Vec3| (to_world.apply(p.as_dvec3()).x as f32 - flank).abs();
+        let worst = second.iter().map(off).fold(0.0, f32::max);
+        assert!(worst < 1e-5, "map {map}: {worst} m");
+    }
+    let without = sample(SampleConfig { second_depth: false, ..samples });
+    let (first, behind) = plain.points.split_at(without.points.len());
+    assert_eq!((without.valid.len(), without.truth(3).is_some()), (4 * side * side, true));
+    assert_eq!((&without.points[..], &without.images), (first, &plain.images));
+
+    // The second surfaces of placed samples lie on the rays of the nominal cameras.
+    let placed = sample(SampleConfig { second_depth: true, front_within_degrees: 0.0, ..placed() });
+    assert_ne!(placed.points[first.len()..], *behind);
+    for (map, degrees) in [(0, 90.0), (1, 270.0)] {
+        let camera = Camera::orbit_at_yaw_degrees(degrees, side as u32);
+        let off = distances((&placed.points, &placed.valid), 4 + map, &to_world, &camera);
+        let mean = off.iter().sum::<f64>() / off.len() as f64;
+        assert!(off.len() > 200 && mean < 0.5, "map {map}: {} points, {mean} px", off.len());
+    }
+}
+
+/// Samples without sides have the same photographs and the same points of front and back as samples with sides.
+#[test]
+fn samples_without_sides_are_those_with_sides_without_them() {
+    let side = 64;
+    let (_temporary, folder) = data_of_armed(side);
+    let area = (side * side) as usize;
+    for (placed_share, upright) in [(0.0, false), (1.0, true)] {
+        let with = SampleConfig { second_depth: true, placed_share, upright, ..SampleConfig::default() };
+        let without = stage1(&folder, SampleConfig { sides: false, ..with.clone() });
+        let with = stage1(&folder, with);
+        for index in 0..8 {
+            let [with, without] = [&with, &without].map(|samples| samples.sample(index).expect("reads"));
+            assert_eq!((&without.images, &without.masks), (&with.images, &with.masks));
+            assert_eq!(without.points, with.points[..6 * area]);
+            assert_eq!(without.valid, with.valid[..2 * area]);
+            assert!(without.truth(2).is_none());
+            let batch = Stage1Batch::new(vec![without], &Device::flex());
+            assert_eq!(batch.points.dims(), [1, 2, side as usize, side as usize, 3]);
+        }
+    }
+}
+
+/// Second surfaces follow the four views in batches, sample by sample.
+#[test]
+fn batches_have_second_surfaces_after_the_views() {
+    let (_temporary, folder) = data_of_armed(64);
+    let samples = SampleConfig { second_depth: true, ..SampleConfig::default() };
+    let mut items: Vec<_> =
+        (0..8).map(|i| stage1(&folder, samples.clone()).sample(i).expect("reads")).collect();
+    items.dedup_by(|a, b| a.points == b.points);
+    items.truncate(2);
+    let batch = Stage1Batch::new(items.clone(), &Device::flex());
+    assert_eq!((batch.points.dims(), batch.valid.dims()), ([2, 6, 64, 64, 3], [2, 6, 64, 64]));
+    let values = |data: TensorData| data.try_into_vec::<f32>().expect("f32");
+    for (sample, item) in items.iter().enumerate() {
+        for view in 0..6 {
+            let at = [sample..sample + 1, view..view + 1];
+            let points = values(batch.points.clone().slice(at.clone()).into_data());
+            let valid = values(batch.valid.clone().slice(at).into_data());
+            assert!(item.truth(view) == Some((&points, &valid)), "sample {sample}, view {view}");
+        }
     }
 }

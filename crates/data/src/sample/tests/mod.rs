@@ -1,5 +1,4 @@
 mod groups;
-mod second;
 
 use std::collections::HashSet;
 

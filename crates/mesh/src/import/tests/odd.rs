@@ -190,11 +190,8 @@ fn glbs_of_every_writer_are_read() {
     assert_eq!(mesh(glb(|json| json + "\0\0\0")).faces.len(), 1);
     // Positions as shares of the largest number, which the node enlarges.
     let quantized = glb(|json| {
-        json.replacen("\"componentType\":5126", "\"componentType\":5122,\"normalized\":true", 1).replacen(
-            "\"byteLength\":36",
-            "\"byteLength\":36,\"byteStride\":12",
-            1,
-        )
+        let json = json.replacen("\"componentType\":5126", "\"componentType\":5122,\"normalized\":true", 1);
+        json.replacen("\"byteLength\":36", "\"byteLength\":36,\"byteStride\":12", 1)
     });
     let found = corners(&mesh(quantized));
     // The upper halves of 1.0 as f32: 0x3f80 of 0x7fff.

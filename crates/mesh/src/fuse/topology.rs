@@ -1,13 +1,20 @@
-//! Closes narrow tunnels through a body, such as a hole between the shells of a shoulder. A dilation fills them; it is
-//! thinned from outside inwards, and only the walls across tunnels are kept of it.
+//! Makes one body without narrow tunnels of the parts of a field. Separate parts are joined with the body, such as a foot
+//! below a skirt or a hand beyond a cuff. Narrow tunnels through the body are closed, such as a hole between the shells of
+//! a shoulder: a dilation fills them; it is thinned from outside inwards, and only the walls across tunnels are kept of it.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::sync::LazyLock;
 
 use glam::I64Vec3;
 
 use super::grid::{Grid, STEPS};
 
+/// Least size of a part, as a share of the body's corners. Smaller pieces are dropped later.
+const PART: f64 = 0.002;
+/// Largest distance of a part from the body, in cubes.
+const FARTHEST: usize = 32;
+/// Not reached yet.
+const NOWHERE: u32 = u32::MAX;
 /// Width of the widest closed tunnel in cubes, 5 cm for a person of 1.7 m.
 const WIDEST: f32 = 8.0;
 
@@ -51,6 +58,67 @@ static CONNECTED: LazyLock<Vec<bool>> =
     LazyLock::new(|| (0..1_u16 << 14).map(|corners| parts(corners) == 1).collect());
 
 impl Grid {
+    /// Joins parts with the body by the shortest paths through the outside, three cubes thick. Returns the part count.
+    pub fn join_parts(&mut self) -> usize {
+        let pieces = self.pieces();
+        let Some(body) = pieces.body() else { return 0 };
+        let least = PART * pieces.sizes[body] as f64;
+        let is_part = |i: usize| pieces.inside[i] && i != body && pieces.sizes[i] as f64 >= least;
+        let mut waits: Vec<bool> = (0..pieces.sizes.len()).map(is_part).collect();
+        if !waits.contains(&true) {
+            return 0;
+        }
+        let steps = self.strides();
+        // Breadth-first search: the predecessor of every corner on the path from the body.
+        let mut from = vec![NOWHERE; pieces.of.len()];
+        let mut front = VecDeque::new();
+        let mut rows: HashMap<usize, Vec<usize>> = HashMap::new();
+        for (row, number) in pieces.of.iter().map(|number| *number as usize).enumerate() {
+            if waits[number] || number == body {
+                rows.entry(number).or_default().push(row);
+            }
+        }
+        let begin = |number: usize, from: &mut [u32], front: &mut VecDeque<(usize, usize)>| {
+            for row in &rows[&number] {
+                from[*row] = *row as u32;
+                front.push_back((*row, 0));
+            }
+        };
+        begin(body, &mut from, &mut front);
+        let (mut joined, mut ways) = (0, Vec::new());
+        while let Some((row, far)) = front.pop_front() {
+            if far > FARTHEST || self.on_border(row) {
+                continue;
+            }
+            for next in steps.iter().flat_map(|step| [row - step, row + step]) {
+                if from[next] != NOWHERE {
+                    continue;
+                }
+                from[next] = row as u32;
+                let number = pieces.of[next] as usize;
+                if !waits[number] {
+                    front.push_back((next, far + 1));
+                    continue;
+                }
+                waits[number] = false;
+                joined += 1;
+                let mut back = row;
+                while from[back] as usize != back {
+                    ways.push(back);
+                    back = from[back] as usize;
+                }
+                // Further parts may be joined with this one.
+                begin(number, &mut from, &mut front);
+            }
+        }
+        for row in ways {
+            for at in self.around_corner(row, 1) {
+                self.values[at] = self.values[at].min(-0.5 * self.cell);
+            }
+        }
+        joined
+    }
+
     /// Closes the tunnels through the inside that are narrower than [`WIDEST`].
     pub fn close_tunnels(&mut self) {
         let inside: Vec<bool> = self.values.iter().map(|value| *value < 0.0).collect();
@@ -112,10 +180,9 @@ impl Grid {
         let cube = (-side..=side).flat_map(|z| {
             (-side..=side).flat_map(move |y| (-side..=side).map(move |x| I64Vec3::new(x, y, z)))
         });
-        let ball: Vec<(I64Vec3, isize, u8)> = cube
-            .filter(|offset| offset.as_vec3().length() <= reach)
-            .map(|offset| (offset, self.step(offset), offset.length_squared() as u8))
-            .collect();
+        let ball = cube.filter(|offset| offset.as_vec3().length() <= reach);
+        let ball = ball.map(|offset| (offset, self.step(offset), offset.length_squared() as u8));
+        let ball: Vec<(I64Vec3, isize, u8)> = ball.collect();
         let strides = self.strides();
         let counts = self.counts.as_i64vec3();
         let mut distances: Vec<u8> = marked.iter().map(|marked| if *marked { 0 } else { FAR }).collect();
@@ -203,5 +270,36 @@ mod tests {
         assert_eq!(handles(&scene).0, 0);
         scene.close_tunnels();
         assert_eq!(scene.values, values);
+    }
+
+    #[test]
+    fn a_foot_is_joined_with_the_body_and_a_speck_is_not() {
+        const N: usize = 81;
+        let ball = |p: Vec3, centre: Vec3, radius: f32| (p - centre).length() - radius;
+        let cell = 2.0 / (N - 1) as f32;
+        let scene = |feet: &[Vec3]| {
+            grid(N, |p| {
+                let body = ball(p, Vec3::new(0.0, 0.3, 0.0), 0.5);
+                let speck = ball(p, Vec3::new(0.7, 0.7, 0.7), 0.04);
+                let feet = feet.iter().map(|foot| ball(p, *foot, 0.1)).fold(f32::MAX, f32::min);
+                body.min(speck).min(feet)
+            })
+        };
+        let mut grid = scene(&[]);
+        assert_eq!((grid.join_parts(), grid.keep_one_body().dropped), (0, 1));
+        // One foot 20 cubes below the body, the other 20 cubes beside the first.
+        let (one, other) = (Vec3::new(0.0, -0.8, 0.0), Vec3::new(0.7, -0.8, 0.0));
+        let mut grid = scene(&[one, other]);
+        assert_eq!((grid.join_parts(), grid.keep_one_body().dropped), (2, 1));
+        let inside = |place: Vec3, within: f32| {
+            (0..grid.values.len())
+                .any(|row| grid.values[row] < 0.0 && grid.place(row).distance(place) < within)
+        };
+        assert!(inside(one, cell) && inside(other, cell));
+        // Several paths are equally short.
+        assert!(
+            inside(Vec3::new(0.0, -0.45, 0.0), 4.0 * cell) && inside(Vec3::new(0.35, -0.8, 0.0), 4.0 * cell)
+        );
+        assert!(!inside(Vec3::new(0.35, -0.45, 0.0), 4.0 * cell));
     }
 }
