@@ -98,10 +98,7 @@ impl Kernel for Resize {
                     sum.fill(0.0);
                     for &(from, weight) in uses {
                         let line = &gradient[from * width..][..width];
-                        vectorized(
-                            #[inline(always)]
-                            || sum.iter_mut().zip(line).for_each(|(sum, x)| *sum += weight * x),
-                        );
+                        vectorized!(|| sum.iter_mut().zip(line).for_each(|(sum, x)| *sum += weight * x));
                     }
                     for (out, uses) in out.iter_mut().zip(&across) {
                         *out = uses.iter().map(|&(from, weight)| weight * sum[from]).sum();

@@ -55,18 +55,12 @@ impl Layer for Linear {
         tasks.zip(kept).for_each(|((out, x), before)| match before {
             Some(before) => {
                 self.product(x, &weight, bias, before);
-                vectorized(
-                    #[inline(always)]
-                    || out.iter_mut().zip(before.iter()).for_each(|(out, z)| *out = gelu(*z)),
-                );
+                vectorized!(|| out.iter_mut().zip(before.iter()).for_each(|(out, z)| *out = gelu(*z)));
             }
             None => {
                 self.product(x, &weight, bias, out);
                 if self.gelu {
-                    vectorized(
-                        #[inline(always)]
-                        || out.iter_mut().for_each(|out| *out = gelu(*out)),
-                    );
+                    vectorized!(|| out.iter_mut().for_each(|out| *out = gelu(*out)));
                 }
             }
         });
@@ -142,12 +136,9 @@ impl Linear {
 
 /// dz = dy · gelu'(z).
 fn derive(z: &[f32], dy: &[f32], dz: &mut [f32]) {
-    vectorized(
-        #[inline(always)]
-        || {
-            for ((dz, z), dy) in dz.iter_mut().zip(z).zip(dy) {
-                *dz = dy * gelu_derivative(*z);
-            }
-        },
-    );
+    vectorized!(|| {
+        for ((dz, z), dy) in dz.iter_mut().zip(z).zip(dy) {
+            *dz = dy * gelu_derivative(*z);
+        }
+    });
 }

@@ -100,54 +100,45 @@ impl LayerNorm {
         statistics: &mut [Statistics],
     ) {
         let c = self.channels;
-        vectorized(
-            #[inline(always)]
-            move || {
-                let rows = x.chunks_exact(c).zip(out.chunks_exact_mut(c)).zip(statistics.iter_mut());
-                for ((x, out), statistics) in rows {
-                    let mean = sum([x], |[x]| x) / c as f32;
-                    let variance = sum([x], |[x]| (x - mean) * (x - mean)) / c as f32;
-                    let scale = 1.0 / (variance + self.epsilon).sqrt();
-                    *statistics = [mean, scale];
-                    for (((out, x), w), b) in out.iter_mut().zip(x).zip(weight).zip(bias) {
-                        *out = (x - mean) * scale * w + b;
-                    }
+        vectorized!(move || {
+            let rows = x.chunks_exact(c).zip(out.chunks_exact_mut(c)).zip(statistics.iter_mut());
+            for ((x, out), statistics) in rows {
+                let mean = sum([x], |[x]| x) / c as f32;
+                let variance = sum([x], |[x]| (x - mean) * (x - mean)) / c as f32;
+                let scale = 1.0 / (variance + self.epsilon).sqrt();
+                *statistics = [mean, scale];
+                for (((out, x), w), b) in out.iter_mut().zip(x).zip(weight).zip(bias) {
+                    *out = (x - mean) * scale * w + b;
                 }
-            },
-        );
+            }
+        });
     }
 }
 
 /// dx = scale · (g − mean(g) − h · mean(g·h)), with the normalised row h and g = dy·weight.
 fn derive(x: &[f32], dy: &[f32], weight: &[f32], statistics: &[Statistics], dx: &mut [f32]) {
     let c = weight.len();
-    vectorized(
-        #[inline(always)]
-        move || {
-            let rows = x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(dx.chunks_exact_mut(c));
-            for (((x, dy), dx), &[mean, scale]) in rows.zip(statistics) {
-                let constant = sum([dy, weight], |[dy, w]| dy * w) / c as f32;
-                let slope = sum([dy, weight, x], |[dy, w, x]| dy * w * ((x - mean) * scale)) / c as f32;
-                for (((dx, x), dy), w) in dx.iter_mut().zip(x).zip(dy).zip(weight) {
-                    *dx = (dy * w - constant - (x - mean) * scale * slope) * scale;
-                }
+    vectorized!(move || {
+        let rows = x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(dx.chunks_exact_mut(c));
+        for (((x, dy), dx), &[mean, scale]) in rows.zip(statistics) {
+            let constant = sum([dy, weight], |[dy, w]| dy * w) / c as f32;
+            let slope = sum([dy, weight, x], |[dy, w, x]| dy * w * ((x - mean) * scale)) / c as f32;
+            for (((dx, x), dy), w) in dx.iter_mut().zip(x).zip(dy).zip(weight) {
+                *dx = (dy * w - constant - (x - mean) * scale * slope) * scale;
             }
-        },
-    );
+        }
+    });
 }
 
 /// Column sums of dy·h (`weight`) and dy (`bias`), with the normalised row h.
 fn column_sums(x: &[f32], dy: &[f32], statistics: &[Statistics], (weight, bias): (&mut [f32], &mut [f32])) {
     let c = weight.len();
-    vectorized(
-        #[inline(always)]
-        move || {
-            for ((x, dy), &[mean, scale]) in x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(statistics) {
-                for (((weight, bias), x), dy) in weight.iter_mut().zip(&mut *bias).zip(x).zip(dy) {
-                    *weight += dy * ((x - mean) * scale);
-                    *bias += dy;
-                }
+    vectorized!(move || {
+        for ((x, dy), &[mean, scale]) in x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(statistics) {
+            for (((weight, bias), x), dy) in weight.iter_mut().zip(&mut *bias).zip(x).zip(dy) {
+                *weight += dy * ((x - mean) * scale);
+                *bias += dy;
             }
-        },
-    );
+        }
+    });
 }
