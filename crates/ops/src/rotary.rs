@@ -25,7 +25,7 @@ pub fn rotary_attention(
     assert_eq!([k.dims(), v.dims()], [q.dims(); 2], "queries, keys and values of one grid");
     let sizes = Attention { batch, tokens, heads, head_dim: c / heads, in_bf16 };
     let tables = [&rope.cos, &rope.sin].map(|table| host(table.clone()));
-    op::run(Attend { sizes, tables }, q, Some(k), Some(v))
+    op::run(Attend { sizes, tables }, q.dims(), q, Some(k), Some(v))
 }
 
 /// [`rotary_attention`] with queries, keys and values side by side in one tensor: `[B, N, 3·C]` → `[B, N, C]`.
@@ -59,10 +59,6 @@ struct Attend {
 }
 
 impl Kernel for Attend {
-    fn shape(&self) -> Vec<usize> {
-        vec![self.sizes.batch, self.sizes.tokens, self.sizes.heads * self.sizes.head_dim]
-    }
-
     fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let tables = self.tables.each_ref().map(Vec::as_slice);
         let (out, logarithms) = self.sizes.forward(inputs, tables);
