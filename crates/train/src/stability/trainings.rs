@@ -16,7 +16,6 @@ use snapsnap_people::{Detail, synth};
 use tempfile::TempDir;
 
 use super::config;
-use crate::TrainError;
 use crate::config::TrainConfig;
 use crate::data::Data;
 use crate::log::Line;
@@ -26,6 +25,7 @@ use crate::run::{Options, Outcome, Watch, on_best_thread, train};
 use crate::stage1::PointTask;
 use crate::stage2::GaussianTask;
 use crate::task::{Moment, Part, Task, Validation};
+use crate::{Result, TrainError};
 use snapsnap_net::Window;
 
 /// Stiff trainings, and one sample whose loss is not a number (docs/method.md, "Stability cases").
@@ -43,12 +43,12 @@ pub(super) fn cases() -> Vec<Case> {
 }
 
 /// A case that does not depend on the device.
-fn case(input: &str, holds: &str, run: impl Fn() -> Result<Found, TrainError> + 'static) -> Case {
+fn case(input: &str, holds: &str, run: impl Fn() -> Result<Found> + 'static) -> Case {
     let run = move |_: &Device| run().unwrap_or_else(Found::broken);
     Case { area: "Stiff training", once: true, ..super::case(input, holds, 0.0, run) }
 }
 
-fn temporary() -> Result<TempDir, TrainError> {
+fn temporary() -> Result<TempDir> {
     tempfile::tempdir().map_err(|e| TrainError::Unsuitable(format!("cannot make a temporary folder: {e}")))
 }
 
@@ -73,7 +73,7 @@ fn trained<T: Task>(
     config: &TrainConfig,
     networks: Networks,
     device: &Device,
-) -> Result<(Outcome, bool), TrainError> {
+) -> Result<(Outcome, bool)> {
     let folder = temporary()?;
     let stop = AtomicBool::new(false);
     let options = Options {
@@ -90,7 +90,7 @@ fn trained<T: Task>(
 }
 
 /// A data set of extreme people: nearly black, over-exposed, in 1 % of the frame, and in nearly all of it.
-fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
+fn extreme_people(root: &Path) -> Result<Arc<Folder>> {
     let mut data = DataConfig::default();
     (data.views.count, data.views.resolution) = (4, 64);
     let person = synth::person("stability", None, Detail::Fine);
@@ -110,10 +110,10 @@ fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
     Ok(data.make(&root.join("people"), "stability", people)?)
 }
 
-fn stiff(factor: f64) -> Result<Found, TrainError> {
+fn stiff(factor: f64) -> Result<Found> {
     let temporary = temporary()?;
     let folder = extreme_people(temporary.path())?;
-    let share = |subject: &str| -> Result<f64, TrainError> {
+    let share = |subject: &str| -> Result<f64> {
         let (_, mask) = folder.person(Some(Split::Train), subject).picture(0, false)?;
         Ok(mask.as_raw().iter().filter(|m| **m > 127).count() as f64 / 4096.0)
     };
@@ -162,12 +162,7 @@ impl Task for Poisoned {
         self.0.extent(items)
     }
 
-    fn losses(
-        &self,
-        networks: &Networks,
-        items: Vec<Stage1Item>,
-        at: Moment,
-    ) -> Result<Vec<Part>, TrainError> {
+    fn losses(&self, networks: &Networks, items: Vec<Stage1Item>, at: Moment) -> Result<Vec<Part>> {
         let is_poisoned = at.step == 3;
         let mut parts = self.0.losses(networks, items, at)?;
         if is_poisoned {
@@ -177,7 +172,7 @@ impl Task for Poisoned {
     }
 }
 
-fn poisoned() -> Result<Found, TrainError> {
+fn poisoned() -> Result<Found> {
     let temporary = temporary()?;
     let folder = extreme_people(temporary.path())?;
     let config = config(&["training.steps=8".into()]);
