@@ -13,7 +13,6 @@ use snapsnap_base::FileError;
 use snapsnap_net::weights::WeightFile;
 use snapsnap_splat::{Camera, Gaussians, scene};
 
-use crate::EvalError;
 use crate::evaluate::model::Model;
 use crate::evaluate::person::{People, photograph};
 use crate::evaluate::{Contestant, Kind, by_person, evaluate, rendered};
@@ -21,6 +20,7 @@ use crate::lpips::Lpips;
 use crate::score::Score;
 use crate::statistics::{Interval, difference, interval, mean, quantile_of_times};
 use crate::variant::Variant;
+use crate::{EvalError, Result};
 
 use config::BenchConfig;
 
@@ -104,17 +104,17 @@ pub fn measure(
     (device, device_name): (&Device, &str),
     (lpips, lpips_weights): (Option<&Lpips>, &str),
     most_used: &dyn Fn() -> Option<u64>,
-) -> Result<Measured, EvalError> {
+) -> Result<Measured> {
     let runs = config.bench.runs;
     let mut eval = config.evaluation(variant);
     let folder = variant.data.as_ref().or(config.data.folders.first());
-    let folder = folder.ok_or_else(|| EvalError::Message("there is no data set".into()))?;
+    let folder = folder.ok_or_else(|| EvalError::new("there is no data set"))?;
     let people = People::open(folder, &eval.data, &eval.views)?;
     let (all, compared) = (people.views(), config.bench.views.min(people.views()));
     eval.views.compared = (0..compared).map(|i| (2 * i + 1) * all / (2 * compared)).collect();
     let nobody = || match eval.data.only.as_slice() {
-        [] => EvalError::Message(format!("{}: has no people", folder.display())),
-        only => EvalError::Message(format!("{}: has no person named {}", folder.display(), only.join(", "))),
+        [] => EvalError::new(format!("{}: has no people", folder.display())),
+        only => EvalError::new(format!("{}: has no person named {}", folder.display(), only.join(", "))),
     };
     let first = people.chosen.first().copied().ok_or_else(nobody)?;
 
@@ -167,7 +167,7 @@ pub fn measure(
     let outcome = evaluate(&eval, std::slice::from_ref(&people), &[contestant], lpips, &|_, _| ());
     let judged = &outcome.judged[0];
     let scores: Vec<Score> = judged.rows.iter().map(|row| row.scores[0]).collect();
-    let score = Score::mean(&scores).ok_or_else(|| EvalError::Message("no view could be compared".into()))?;
+    let score = Score::mean(&scores).ok_or_else(|| EvalError::new("no view could be compared"))?;
     let points = |sides: bool| {
         let errors = judged.points.iter().filter(|error| (error.view > 1) == sides);
         mean(&errors.map(|error| 1e3 * error.mean).collect::<Vec<_>>())
@@ -200,7 +200,7 @@ pub fn measure(
 }
 
 /// The result of the last of `count` calls, and the median of their seconds.
-fn timed<T>(count: usize, mut call: impl FnMut() -> Result<T, EvalError>) -> Result<(T, f64), EvalError> {
+fn timed<T>(count: usize, mut call: impl FnMut() -> Result<T>) -> Result<(T, f64)> {
     let (mut times, mut last) = (Vec::new(), None);
     for _ in 0..count {
         let start = Instant::now();

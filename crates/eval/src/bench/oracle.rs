@@ -5,18 +5,14 @@ use snapsnap_ops::host;
 use snapsnap_splat::reference::{self, Cutoff, Scene};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
-use crate::EvalError;
+use crate::Result;
 
 /// Largest α of a splat in the oracle without cut-offs.
 const WHOLE: f32 = 0.999_99;
 
 /// Largest differences of a colour in a view: between renderer and oracle with the same cut-offs, and between oracles
 /// with and without cut-offs. Without cut-offs pixels never close, and splats fade smoothly and may be opaque.
-pub(super) fn errors(
-    gaussians: &Gaussians,
-    camera: &Camera,
-    options: &RenderOptions,
-) -> Result<(f64, f64), EvalError> {
+pub(super) fn errors(gaussians: &Gaussians, camera: &Camera, options: &RenderOptions) -> Result<(f64, f64)> {
     let got = host(render(gaussians, std::slice::from_ref(camera), options)?.color);
     let Gaussians { means, rotations, scales, opacities, colors } = gaussians.clone();
     let rows = host(Tensor::cat(vec![means, rotations, scales, opacities.unsqueeze_dim(1), colors], 1));

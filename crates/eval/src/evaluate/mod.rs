@@ -17,7 +17,7 @@ use image::RgbImage;
 use rayon::prelude::*;
 use snapsnap_data::sample::{PhotographChanges, TestItem};
 
-use crate::EvalError;
+use crate::Result;
 use crate::foreign::Traces;
 use crate::geometry::Align;
 use crate::lpips::Lpips;
@@ -150,7 +150,7 @@ struct Place<'a> {
 }
 
 /// A contestant's index, and its scores by protocol with the traces of the background.
-type Scored = (usize, Result<(Vec<Score>, Option<Traces>), EvalError>);
+type Scored = (usize, Result<(Vec<Score>, Option<Traces>)>);
 
 impl Place<'_> {
     /// Records a failure; `what` follows the person's name.
@@ -197,7 +197,7 @@ impl Place<'_> {
             [view] => vec![compare(view)],
             views => views.par_iter().map(compare).collect(),
         });
-        let found: Vec<Result<Vec<Scored>, EvalError>> = found.collect();
+        let found: Vec<Result<Vec<Scored>>> = found.collect();
         for (view, found) in compared.into_iter().zip(found) {
             let degrees = person::degrees(&item.cameras[view], &item.cameras[inputs[0]]);
             let scored = self.kept(outcome, &format!(", view {view}"), found);
@@ -242,12 +242,7 @@ impl Place<'_> {
     }
 
     /// Compares the pictures of a view.
-    fn compare(
-        &self,
-        item: &TestItem,
-        view: usize,
-        shown: &[Option<Shown>],
-    ) -> Result<Vec<Scored>, EvalError> {
+    fn compare(&self, item: &TestItem, view: usize, shown: &[Option<Shown>]) -> Result<Vec<Scored>> {
         let Self { config, people, .. } = *self;
         let side = people.side(&config.views);
         let (target, mask) = people.target(self.row, view, side)?;
@@ -308,7 +303,7 @@ fn pictures(
     people: &People,
     row: usize,
     contestant: &Contestant,
-) -> Result<Vec<RgbImage>, EvalError> {
+) -> Result<Vec<RgbImage>> {
     let inputs = people.inputs(&config.views);
     let item = people.item(row, &inputs, &PhotographChanges::default())?;
     let side = people.side(&config.views);

@@ -16,9 +16,9 @@ use snapsnap_photo::on_canvas;
 use snapsnap_splat::Camera;
 
 use super::config::{DataSection, ViewsSection};
-use crate::EvalError;
 use crate::geometry::double;
 use crate::pictures::Picture;
+use crate::{EvalError, Result};
 
 /// The people of one data set.
 pub struct People {
@@ -35,7 +35,7 @@ impl People {
     ///
     /// # Errors
     /// [`EvalError`] if the folder is no data set, or does not have the views of the config.
-    pub fn open(path: &Path, data: &DataSection, views: &ViewsSection) -> Result<Self, EvalError> {
+    pub fn open(path: &Path, data: &DataSection, views: &ViewsSection) -> Result<Self> {
         let folder = Arc::new(Folder::open(path)?);
         let wrong = |message: &str| EvalError::File(FileError::unsuitable(path, message));
         if let Some(split) = data.split.filter(|split| !folder.splits().contains(&Some(*split))) {
@@ -87,12 +87,7 @@ impl People {
     ///
     /// # Errors
     /// [`EvalError::File`], also for a camera that mirrors: no quaternion can express the mirrored Gaussians.
-    pub fn item(
-        &self,
-        row: usize,
-        inputs: &[usize],
-        changes: &PhotographChanges,
-    ) -> Result<TestItem, EvalError> {
+    pub fn item(&self, row: usize, inputs: &[usize], changes: &PhotographChanges) -> Result<TestItem> {
         let item = self.test.sample(row, inputs, changes)?;
         let mirrors = |camera: &Camera| camera.world_to_camera.rotation.determinant() < 0.0;
         if let Some(view) = item.cameras.iter().position(mirrors) {
@@ -107,7 +102,7 @@ impl People {
     ///
     /// # Errors
     /// [`EvalError::File`].
-    pub fn target(&self, row: usize, view: usize, side: usize) -> Result<(Picture, Vec<f32>), EvalError> {
+    pub fn target(&self, row: usize, view: usize, side: usize) -> Result<(Picture, Vec<f32>)> {
         let (values, mask) = self.test.target(row, view, [0.0; 3])?;
         let stored = self.folder.description().resolution as usize;
         let values = smaller(values, 3, stored, side);
@@ -168,7 +163,7 @@ pub fn points(
     views: &[usize],
     stored: usize,
     side: usize,
-) -> Result<Option<Points>, EvalError> {
+) -> Result<Option<Points>> {
     if !stored.is_multiple_of(side) {
         return Ok(None);
     }

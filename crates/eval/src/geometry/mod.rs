@@ -16,7 +16,7 @@ use snapsnap_mesh::mesh::Mesh;
 use snapsnap_ops::host;
 use snapsnap_splat::Gaussians;
 
-use crate::EvalError;
+use crate::{EvalError, Result};
 pub(crate) use align::{ALIGNED, procrustes};
 pub use align::{Align, Alignment, icp};
 pub use normals::{consistency, normals};
@@ -47,13 +47,12 @@ impl Chamfer {
 ///
 /// # Errors
 /// [`EvalError::Message`] if no Gaussian is so opaque.
-pub(crate) fn opaque_centres(gaussians: &Gaussians, most: usize) -> Result<Vec<[f32; 3]>, EvalError> {
+pub(crate) fn opaque_centres(gaussians: &Gaussians, most: usize) -> Result<Vec<[f32; 3]>> {
     let means = host(gaussians.means.clone());
     let centres = means.as_chunks().0.iter().zip(host(gaussians.opacities.clone()));
     let centres: Vec<[f32; 3]> = centres.filter(|(_, own)| *own >= OPAQUE).map(|(p, _)| *p).collect();
     if centres.is_empty() {
-        let message = format!("no Gaussian has an opacity of {OPAQUE} or more");
-        return Err(EvalError::Message(message));
+        return Err(EvalError::new(format!("no Gaussian has an opacity of {OPAQUE} or more")));
     }
     Ok(thinned(&centres, most))
 }
@@ -64,13 +63,13 @@ pub(crate) fn thinned<T: Copy>(all: &[T], most: usize) -> Vec<T> {
     (0..kept).map(|i| all[i * all.len() / kept]).collect()
 }
 
-fn check_points(points: &[[f32; 3]]) -> Result<(), EvalError> {
+fn check_points(points: &[[f32; 3]]) -> Result<()> {
     if points.is_empty() {
-        return Err(EvalError::Message("there is no point".into()));
+        return Err(EvalError::new("there is no point"));
     }
     // Written so that a NaN fails as well.
     match points.iter().position(|p| !p.iter().all(|v| v.abs() <= FARTHEST)) {
-        Some(row) => Err(EvalError::Message(format!("point {row} is not finite, or beyond {FARTHEST:e} m"))),
+        Some(row) => Err(EvalError::new(format!("point {row} is not finite, or beyond {FARTHEST:e} m"))),
         None => Ok(()),
     }
 }
@@ -79,7 +78,7 @@ fn check_points(points: &[[f32; 3]]) -> Result<(), EvalError> {
 ///
 /// # Errors
 /// [`EvalError::Message`] for a set without points or with one that is not finite.
-pub fn chamfer(a: &[[f32; 3]], b: &[[f32; 3]]) -> Result<Chamfer, EvalError> {
+pub fn chamfer(a: &[[f32; 3]], b: &[[f32; 3]]) -> Result<Chamfer> {
     check_points(a)?;
     check_points(b)?;
     let one_way = |from: &[[f32; 3]], to: &[[f32; 3]]| {
@@ -110,7 +109,7 @@ pub(crate) fn distance(a: [f32; 3], b: [f32; 3]) -> f64 {
 ///
 /// # Errors
 /// [`EvalError::Message`] without points, if a point is not finite, or for a mesh without area.
-pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalError> {
+pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64> {
     check_points(points)?;
     check_points(&mesh.positions.iter().map(|p| p.to_array()).collect::<Vec<_>>())?;
     let vertices = mesh.positions.iter().map(|p| Vector::new(p.x, p.y, p.z)).collect();
@@ -119,8 +118,8 @@ pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalErr
     faces.iter_mut().for_each(|corners| corners.sort_unstable());
     faces.sort_unstable();
     faces.dedup();
-    let surface = TriMesh::new(vertices, faces)
-        .map_err(|e| EvalError::Message(format!("the mesh has no surface: {e}")))?;
+    let surface =
+        TriMesh::new(vertices, faces).map_err(|e| EvalError::new(format!("the mesh has no surface: {e}")))?;
     let apart = |p: &[f32; 3]| {
         let on = surface.project_local_point(Vector::new(p[0], p[1], p[2]), false).point;
         distance(*p, [on.x, on.y, on.z])
@@ -133,7 +132,7 @@ pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64, EvalErr
 ///
 /// # Errors
 /// [`EvalError::Message`] for a mesh without area.
-pub fn sampled(mesh: &Mesh, count: usize, seed: u64) -> Result<Vec<[f32; 3]>, EvalError> {
+pub fn sampled(mesh: &Mesh, count: usize, seed: u64) -> Result<Vec<[f32; 3]>> {
     let corners = |face: usize| mesh.faces[face].positions.map(|row| mesh.positions[row as usize].as_dvec3());
     let mut total = 0.0;
     let areas: Vec<f64> = (0..mesh.faces.len())
@@ -144,7 +143,7 @@ pub fn sampled(mesh: &Mesh, count: usize, seed: u64) -> Result<Vec<[f32; 3]>, Ev
         })
         .collect();
     if !(total > 0.0 && total.is_finite()) {
-        return Err(EvalError::Message("the mesh has no area".into()));
+        return Err(EvalError::new("the mesh has no area"));
     }
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut one = || {
