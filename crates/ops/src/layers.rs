@@ -154,7 +154,7 @@ struct Operator<L> {
 
 impl<L: Layer> Kernel for Operator<L> {
     fn forward(&self, [x, weight, bias]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
-        let (out, kept) = self.layer.forward(x, weight, self.has_bias.then_some(bias), keep);
+        let (out, kept) = self.layer.forward([x, weight], self.has_bias.then_some(bias), keep);
         (out, keep.then(|| Box::new(kept) as _))
     }
 

@@ -40,13 +40,7 @@ impl Layer for Linear {
     type Kept = Option<Floats>;
 
     /// x · weight + bias, then GELU if the layer has it: `x` `[rows, inputs]` → `[rows, outputs]`.
-    fn forward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        bias: Option<&[f32]>,
-        keep: bool,
-    ) -> (Vec<f32>, Option<Floats>) {
+    fn forward(&self, [x, weight]: [&[f32]; 2], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept) {
         let (size, piece) = (self.rows * self.outputs, ROWS * self.outputs);
         let (mut out, mut before) = (take(size), (self.gelu && keep).then(|| Floats::new(size)));
         let weight = Right::new(self.in_bf16, [self.inputs, self.outputs], (weight, self.strides()));

@@ -28,13 +28,7 @@ impl Layer for LayerNorm {
     type Kept = Vec<Statistics>;
 
     /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]` and each row's statistics.
-    fn forward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        bias: Option<&[f32]>,
-        _keep: bool,
-    ) -> (Vec<f32>, Vec<Statistics>) {
+    fn forward(&self, [x, weight]: [&[f32]; 2], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, Self::Kept) {
         let bias = bias.expect("the published norms have biases");
         let mut out = take(x.len());
         let mut statistics = vec![[0.0; 2]; x.len() / self.channels];
@@ -45,12 +39,8 @@ impl Layer for LayerNorm {
     }
 
     /// If the gradient of weight or bias is wanted, both are computed.
-    fn backward(
-        &self,
-        [x, weight, dy]: [&[f32]; 3],
-        statistics: Vec<Statistics>,
-        [of_input, of_weight, of_bias]: [bool; 3],
-    ) -> InputGradients {
+    fn backward(&self, given: [&[f32]; 3], statistics: Self::Kept, wanted: [bool; 3]) -> InputGradients {
+        let ([x, weight, dy], [of_input, of_weight, of_bias]) = (given, wanted);
         let (c, piece) = (self.channels, ROWS * self.channels);
         let blocks = statistics.len().div_ceil(ROWS);
         let summed = of_weight || of_bias;

@@ -206,8 +206,8 @@ fn resizing_equals_burns() {
 /// Results and gradients of all operators, at sizes that need several tasks.
 fn everything(in_bf16: bool) -> Vec<Vec<f32>> {
     fn add<L: Layer>(all: &mut Vec<Vec<f32>>, layer: &L, [x, weight, bias, dy]: [&[f32]; 4]) {
-        let (result, kept) = layer.forward(x, weight, Some(bias), true);
-        assert_eq!(layer.forward(x, weight, Some(bias), false).0, result);
+        let (result, kept) = layer.forward([x, weight], Some(bias), true);
+        assert_eq!(layer.forward([x, weight], Some(bias), false).0, result);
         all.push(result);
         all.extend(layer.backward([x, weight, dy], kept, [true; 3]).into_iter().flatten());
     }
