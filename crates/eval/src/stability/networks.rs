@@ -216,7 +216,7 @@ fn attended(tokens: &[f32], values: &[f32], device: &Device) -> Found {
     let shape = [1, TOKENS, CHANNELS];
     let [q, k, v] = [tokens, tokens, values].map(|rows| tracked(rows.to_vec(), shape, device));
     let rope = Rope::new(3, 4, CHANNELS / HEADS, 100.0, &device.clone().autodiff());
-    let out = rotary_attention(q.clone(), k.clone(), v.clone(), &rope, HEADS, false);
+    let out = rotary_attention([&q, &k, &v].map(Tensor::clone), &rope, HEADS, false);
     let gradients = out.clone().sum().backward();
     let gradient: Vec<f32> =
         [&q, &k, &v].iter().flat_map(|t| host(t.grad(&gradients).expect("tracked"))).collect();

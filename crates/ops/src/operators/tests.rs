@@ -182,10 +182,10 @@ fn rotary_attention_equals_burns() {
             if has_kernels(&q) {
                 let in_bf16 = is_bf16(&pairs.keys);
                 let [k, v] = [k, v].map(|x| x.cast(FloatDType::F32));
-                return rotary_attention(q, k, v, &rope, heads, in_bf16);
+                return rotary_attention([q, k, v], &rope, heads, in_bf16);
             }
             let [cos, sin] = [&rope.cos, &rope.sin].map(|table| table.clone().cast(FloatDType::F64));
-            plain_attention(q, k, v, &Rope { cos, sin }, heads)
+            plain_attention([q, k, v], &Rope { cos, sin }, heads)
         };
         let pairs = Pairs { keys: zeros(), values: zeros() };
         check(&format!("{rows}×{columns} tokens"), pairs, [batch, n, c], run);
