@@ -82,14 +82,8 @@ fn sum<const N: usize>(slices: [&[f32]; N], f: impl Fn([f32; N]) -> f32) -> f32 
 
 impl LayerNorm {
     /// Normalises rows, and writes their statistics.
-    fn normalise(
-        self,
-        x: &[f32],
-        [weight, bias]: [&[f32]; 2],
-        out: &mut [f32],
-        statistics: &mut [Statistics],
-    ) {
-        let c = self.channels;
+    fn normalise(self, x: &[f32], factors: [&[f32]; 2], out: &mut [f32], statistics: &mut [Statistics]) {
+        let (c, [weight, bias]) = (self.channels, factors);
         vectorized!(move || {
             let rows = x.chunks_exact(c).zip(out.chunks_exact_mut(c)).zip(statistics.iter_mut());
             for ((x, out), statistics) in rows {
