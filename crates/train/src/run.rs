@@ -195,7 +195,7 @@ impl<'a, T: Task> Session<'a, T> {
                 Err(damaged) => {
                     let former = options.folder.join(FORMER);
                     let Ok(there) = checkpoint::load(&former, &mut learner, &device) else {
-                        return Err(damaged.into());
+                        return Err(damaged);
                     };
                     watch.note(&format!("{damaged}; the run goes on from the state before it"));
                     there
