@@ -153,27 +153,21 @@ pub type Points = (Vec<f32>, Vec<f32>);
 
 /// Ground-truth points of some views on a canvas of `side` pixels: `[V,S,S,3]` metres in the first view's frame, and
 /// their mask `[V,S,S]`. A pixel of the canvas has the mean of its stored points, if at least half of its area has
-/// points. `None` if `side` does not divide the stored side.
+/// points. `None` if `side` does not divide the stored side `from`.
 ///
 /// # Errors
 /// [`EvalError`] for a file of a view that cannot be read.
-pub fn points(
-    test: &Test,
-    row: usize,
-    views: &[usize],
-    stored: usize,
-    side: usize,
-) -> Result<Option<Points>> {
-    if !stored.is_multiple_of(side) {
+pub fn points(test: &Test, row: usize, views: &[usize], from: usize, side: usize) -> Result<Option<Points>> {
+    if !from.is_multiple_of(side) {
         return Ok(None);
     }
     let (points, valid) = test.points(row, views)?;
-    if stored == side {
+    if from == side {
         return Ok(Some((points, valid)));
     }
-    let area = stored * stored;
+    let area = from * from;
     let views = points.chunks_exact(3 * area).zip(valid.chunks_exact(area));
-    let (points, valid): (Vec<_>, Vec<_>) = views.map(|(p, v)| means(p, v, stored, side)).unzip();
+    let (points, valid): (Vec<_>, Vec<_>) = views.map(|(p, v)| means(p, v, from, side)).unzip();
     Ok(Some((points.concat(), valid.concat())))
 }
 

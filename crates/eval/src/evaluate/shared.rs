@@ -73,14 +73,9 @@ pub(super) fn at_once(side: usize) -> usize {
 ///
 /// # Errors
 /// [`EvalError`](crate::EvalError) for Gaussians that cannot be rendered.
-pub fn rendered(
-    gaussians: &Gaussians,
-    camera: &Camera,
-    side: usize,
-    views: &ViewsSection,
-) -> Result<Picture> {
+pub fn rendered(shown: &Gaussians, camera: &Camera, side: usize, views: &ViewsSection) -> Result<Picture> {
     let large = side * views.supersampling;
     let camera = camera.resized(large as u32, large as u32);
-    let color = render(gaussians, std::slice::from_ref(&camera), &views.render_options())?.color;
+    let color = render(shown, std::slice::from_ref(&camera), &views.render_options())?.color;
     Picture::rendered(&snapsnap_ops::host(color), [large, large], views.supersampling)
 }
