@@ -192,7 +192,7 @@ pub fn measure(
         render,
         gaussians,
         score,
-        people: by_person(&judged.rows, 0).into_iter().map(of_person).collect(),
+        people: by_person(judged.rows.iter(), 0).into_iter().map(of_person).collect(),
         lpips_weights: lpips_weights.into(),
         points_mm: points(false),
         sides_mm: points(true),

@@ -79,10 +79,7 @@ pub struct Judged {
 }
 
 /// Mean score of each person's views, by index in [`Outcome::people`].
-pub(crate) fn by_person<'a>(
-    rows: impl IntoIterator<Item = &'a Row>,
-    protocol: usize,
-) -> BTreeMap<usize, Score> {
+pub(crate) fn by_person<'a>(rows: impl Iterator<Item = &'a Row>, protocol: usize) -> BTreeMap<usize, Score> {
     let mut scores: BTreeMap<usize, Vec<Score>> = BTreeMap::new();
     for row in rows {
         scores.entry(row.person).or_default().push(row.scores[protocol]);
@@ -298,17 +295,12 @@ pub fn sheet(
 }
 
 /// A row of the sheet.
-fn pictures(
-    config: &EvalConfig,
-    people: &People,
-    row: usize,
-    contestant: &Contestant,
-) -> Result<Vec<RgbImage>> {
+fn pictures(config: &EvalConfig, people: &People, row: usize, model: &Contestant) -> Result<Vec<RgbImage>> {
     let inputs = people.inputs(&config.views);
     let item = people.item(row, &inputs, &PhotographChanges::default())?;
     let side = people.side(&config.views);
     let truth = (config.metrics.align != Align::None).then(|| truth(people, row)).transpose()?;
-    let shown = contestant.prepare(people, row, &item, &inputs, side, (&config.metrics, truth.as_ref()))?;
+    let shown = model.prepare(people, row, &item, &inputs, side, (&config.metrics, truth.as_ref()))?;
     let mut pictures = Vec::new();
     for view in &inputs[..2] {
         let (target, _) = people.target(row, *view, side)?;
@@ -316,7 +308,7 @@ fn pictures(
     }
     for wanted in &config.report.degrees {
         let view = person::nearest_view(&item.cameras, inputs[0], *wanted);
-        let views = contestant.views(&config.views);
+        let views = model.views(&config.views);
         let image = rendered(&shown.gaussians, &item.cameras[view], side, &views)?;
         let (target, _) = people.target(row, view, side)?;
         let window = Region::paper(&target)?.window;

@@ -236,18 +236,13 @@ impl Model {
     }
 
     /// The Gaussians that stride, least opacity and `only_front` (the first photograph's) keep, and their origins.
-    fn thinned(
-        &self,
-        gaussians: Gaussians,
-        origins: &[Origin],
-        only_front: bool,
-    ) -> (Gaussians, Vec<Origin>) {
+    fn thinned(&self, person: Gaussians, origins: &[Origin], only_front: bool) -> (Gaussians, Vec<Origin>) {
         let Variant { stride, min_opacity, .. } = self.variant;
         let (stride, min_opacity) = (stride.unwrap_or(1), min_opacity.unwrap_or(0.0));
         if stride == 1 && min_opacity <= 0.0 && !only_front {
-            return (gaussians, origins.to_vec());
+            return (person, origins.to_vec());
         }
-        let (side, opacities) = (self.side(), host(gaussians.opacities.clone()));
+        let (side, opacities) = (self.side(), host(person.opacities.clone()));
         let is_kept = |row: &usize| {
             let Origin { view, pixel } = origins[*row];
             let on_grid =
@@ -256,7 +251,7 @@ impl Model {
         };
         let keep: Vec<i32> = (0..origins.len()).filter(is_kept).map(|row| row as i32).collect();
         let kept = keep.iter().map(|row| origins[*row as usize]).collect();
-        let gaussians = rows(&gaussians, &keep);
+        let gaussians = rows(&person, &keep);
         (Gaussians { scales: gaussians.scales * stride as f64, ..gaussians }, kept)
     }
 }

@@ -65,11 +65,8 @@ pub fn sixteen_bits(weights: WeightFile, photographs: [Photograph; 2]) -> Vec<Ca
     [Precision::F16, Precision::Bf16].map(case).into()
 }
 
-fn in_precision(
-    (weights, [front, back]): &(WeightFile, [Photograph; 2]),
-    precision: Precision,
-    device: &Device,
-) -> Found {
+fn in_precision(given: &(WeightFile, [Photograph; 2]), precision: Precision, device: &Device) -> Found {
+    let (weights, [front, back]) = given;
     if !device.supports_dtype(precision.dtype()) {
         return Found::skipped(format!("the device does not compute in {}", precision.name()));
     }

@@ -115,7 +115,7 @@ impl Evaluation<'_> {
         };
         let plain = |judged: &Judged| {
             self.by_protocol(|protocol| {
-                let mut value = figures(Self::overall(&by_person(&judged.rows, protocol)));
+                let mut value = figures(Self::overall(&by_person(judged.rows.iter(), protocol)));
                 value["sides_psnr"] = json!(Self::sides(judged, protocol));
                 value
             })
@@ -159,7 +159,7 @@ impl Evaluation<'_> {
     }
 
     fn protocol_json(&self, model: &Judged, protocol: usize) -> Value {
-        let people = by_person(&model.rows, protocol);
+        let people = by_person(model.rows.iter(), protocol);
         let subject = |(person, score): (&usize, &Score)| {
             let mut value = json!(score);
             value["name"] = json!(self.outcome.people[*person]);
@@ -214,7 +214,7 @@ impl Evaluation<'_> {
         let Some((model, (protocol, _))) = self.model().zip(self.protocols().last()) else {
             return Vec::new();
         };
-        let mut people: Vec<(usize, Score)> = by_person(&model.rows, protocol).into_iter().collect();
+        let mut people: Vec<(usize, Score)> = by_person(model.rows.iter(), protocol).into_iter().collect();
         people.sort_by(|a, b| b.1.psnr.total_cmp(&a.1.psnr));
         let n = people.len();
         let starts = [0, (n / 2).saturating_sub(count / 2), n.saturating_sub(count)];
