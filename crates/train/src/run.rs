@@ -63,9 +63,9 @@ pub trait Watch {
     /// A step was logged. `steps` is the number of steps of the run, `skipped` the number of skipped steps so far.
     fn step(&mut self, line: &Line, steps: u64, skipped: u64);
     /// A validation was made after `step` steps.
-    fn validated(&mut self, step: u64, validation: &Validation);
+    fn validated(&mut self, _step: u64, _validation: &Validation) {}
     /// A message for the user.
-    fn note(&mut self, message: &str);
+    fn note(&mut self, _message: &str) {}
 }
 
 /// Outcome of a session.

@@ -24,7 +24,7 @@ use crate::ranks::Ranks;
 use crate::run::{Options, Outcome, Watch, on_best_thread, train};
 use crate::stage1::PointTask;
 use crate::stage2::GaussianTask;
-use crate::task::{Moment, Part, Task, Validation};
+use crate::task::{Moment, Part, Task};
 use crate::{Result, TrainError};
 use snapsnap_net::Window;
 
@@ -52,18 +52,13 @@ fn temporary() -> Result<TempDir> {
     tempfile::tempdir().map_err(|e| TrainError::Unsuitable(format!("cannot make a temporary folder: {e}")))
 }
 
-struct Silent {
-    finite: bool,
-}
+/// Whether all logged numbers are finite.
+struct AllFinite(bool);
 
-impl Watch for Silent {
+impl Watch for AllFinite {
     fn step(&mut self, line: &Line, _: u64, _: u64) {
-        self.finite &= line.values.values().all(|value| value.is_finite());
+        self.0 &= line.values.values().all(|value| value.is_finite());
     }
-
-    fn validated(&mut self, _: u64, _: &Validation) {}
-
-    fn note(&mut self, _: &str) {}
 }
 
 /// A short training in a temporary folder: its outcome, and whether all logged numbers are finite. Weights that
@@ -74,19 +69,12 @@ fn trained<T: Task>(
     networks: Networks,
     device: &Device,
 ) -> Result<(Outcome, bool)> {
-    let folder = temporary()?;
-    let stop = AtomicBool::new(false);
-    let options = Options {
-        folder: folder.path(),
-        device,
-        ranks: &Ranks::default(),
-        limit: None,
-        stop: &stop,
-        force: false,
-    };
-    let mut watch = Silent { finite: true };
+    let (temporary, ranks, stop) = (temporary()?, Ranks::default(), AtomicBool::new(false));
+    let folder = temporary.path();
+    let options = Options { folder, device, ranks: &ranks, limit: None, stop: &stop, force: false };
+    let mut watch = AllFinite(true);
     let outcome = on_best_thread(device, || train(task, config, networks, &options, &mut watch))?;
-    Ok((outcome, watch.finite))
+    Ok((outcome, watch.0))
 }
 
 /// A data set of extreme people: nearly black, over-exposed, in 1 % of the frame, and in nearly all of it.
