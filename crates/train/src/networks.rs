@@ -74,9 +74,8 @@ impl Networks {
     /// intermediate results for the backward pass. Gradients flow back to these networks. Weights, moments and losses
     /// stay in 32 bits.
     pub fn in_precision(&self, precision: Precision) -> Self {
-        let mut networks = self.clone();
-        networks.predictor = networks.predictor.map(|predictor| precision.lower(predictor));
-        networks
+        let Self { predictor, regressors } = self.clone();
+        Self { predictor: predictor.map(|predictor| precision.lower(predictor)), regressors }
     }
 
     /// All parameters with their values, without gradients.

@@ -130,23 +130,18 @@ impl GaussianTask {
             };
             let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
             let gaussians = gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), device);
-            Ok(sums.add(&item, self.render(&gaussians, &item.target_cameras, item.background)?.0)?)
+            Ok(sums.add(&item, pictures(&gaussians, &item.target_cameras, item.background)?.0)?)
         })?;
         Ok(*self.billboard_scores.get_or_init(|| Scores::mean(&all)))
     }
+}
 
-    /// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`. Without Gaussians the pictures show the background.
-    fn render(
-        &self,
-        gaussians: &Gaussians,
-        cameras: &[Camera],
-        background: [f32; 3],
-    ) -> Result<(Tensor<4>, Tensor<3>)> {
-        let color = Tensor::<1>::from_floats(background, &gaussians.device());
-        let options = RenderOptions { background: Some(color), ..RenderOptions::inria() };
-        let rendered = render(gaussians, cameras, &options)?;
-        Ok((rendered.color.permute([0, 3, 1, 2]), rendered.alpha))
-    }
+/// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`. Without Gaussians the pictures show the background.
+fn pictures(shown: &Gaussians, cameras: &[Camera], background: [f32; 3]) -> Result<(Tensor<4>, Tensor<3>)> {
+    let color = Tensor::<1>::from_floats(background, &shown.device());
+    let options = RenderOptions { background: Some(color), ..RenderOptions::inria() };
+    let rendered = render(shown, cameras, &options)?;
+    Ok((rendered.color.permute([0, 3, 1, 2]), rendered.alpha))
 }
 
 impl Task for GaussianTask {
@@ -193,7 +188,7 @@ impl Task for GaussianTask {
                 continue;
             }
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
-            let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
+            let (image, coverage) = pictures(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
             let [l1, ssim] = photometric(image, target);
             add("l1", L1_SHARE, l1);
@@ -217,7 +212,7 @@ impl Task for GaussianTask {
         }
         let all = self.data.validated(ranks, |sums: &mut Scores, item| {
             let gaussians = self.whole(networks, &item);
-            Ok(sums.add(&item, self.render(&gaussians, &item.target_cameras, item.background)?.0)?)
+            Ok(sums.add(&item, pictures(&gaussians, &item.target_cameras, item.background)?.0)?)
         })?;
         let [full, masked, sides, ssim] = Scores::mean(&all);
         let [_, billboard_masked, billboard_sides, _] = self.billboard(ranks)?;
@@ -245,7 +240,7 @@ impl Task for GaussianTask {
             let mut row = vec![photo(0), photo(1)];
             let views = [0, item.target_cameras.len() - 2];
             let cameras = views.map(|v| item.target_cameras[v]);
-            let seen = host(self.render(&self.whole(networks, &item), &cameras, item.background)?.0);
+            let seen = host(pictures(&self.whole(networks, &item), &cameras, item.background)?.0);
             let (side, area) = (item.target_side, item.target_side.pow(2));
             for (place, view) in views.into_iter().enumerate() {
                 let at = |values: &[f32], view: usize, i: usize| {
