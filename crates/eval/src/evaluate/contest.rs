@@ -120,13 +120,9 @@ impl Contestant {
                 let unchanged = item;
                 let item = own.as_ref().unwrap_or(item);
                 let mut made = model.reconstruct(item, inputs)?;
-                let aligned = match metrics.align {
-                    Align::None => None,
-                    _ => {
-                        let (gaussians, maps) = (&mut made.gaussians, &mut made.maps);
-                        Some(aligned(gaussians, maps, metrics, truth, &item.cameras[inputs[0]])?)
-                    }
-                };
+                let front = &item.cameras[inputs[0]];
+                let align = || aligned(&mut made.gaussians, &mut made.maps, metrics, truth, front);
+                let aligned = (metrics.align != Align::None).then(align).transpose()?;
                 // Pictures can be compared without errors of points.
                 let points = errors(people, row, unchanged, inputs, &made.maps, model.side());
                 let points = points.map_err(|e| e.to_string());
