@@ -20,3 +20,13 @@ pub enum EvalError {
     #[error(transparent)]
     Splat(#[from] SplatError),
 }
+
+impl EvalError {
+    /// An error with this message.
+    pub(crate) fn new(message: impl ToString) -> Self {
+        Self::Message(message.to_string())
+    }
+}
+
+/// The result of a comparison.
+pub type Result<T, E = EvalError> = std::result::Result<T, E>;

@@ -6,7 +6,7 @@ use std::collections::{BTreeSet, HashMap};
 use image::imageops::{FilterType, resize};
 use image::{GrayImage, RgbImage};
 
-use crate::EvalError;
+use crate::Result;
 use crate::geometry::nearest;
 use crate::pictures::Picture;
 use crate::region::{Region, margin};
@@ -50,8 +50,8 @@ impl Palette {
     /// The traces of the background in a picture whose truth is `target`, with the person's share `mask` of each pixel.
     ///
     /// # Errors
-    /// [`EvalError::Message`] for a mask without a person.
-    pub fn traces(&self, image: &Picture, target: &Picture, mask: &[f32]) -> Result<Traces, EvalError> {
+    /// [`EvalError::Message`](crate::EvalError::Message) for a mask without a person.
+    pub fn traces(&self, image: &Picture, target: &Picture, mask: &[f32]) -> Result<Traces> {
         let region = Region::masked(mask, [image.height, image.width], margin(image.height))?;
         let color = |of: &Picture, i: usize| [0, 1, 2].map(|c| of.plane(c)[i]);
         let own: Vec<usize> = (0..mask.len()).filter(|i| mask[*i] > 0.5).collect();

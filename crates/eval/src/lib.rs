@@ -19,4 +19,4 @@ pub mod stability;
 pub mod statistics;
 pub mod variant;
 
-pub use error::EvalError;
+pub use error::{EvalError, Result};

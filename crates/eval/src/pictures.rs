@@ -5,9 +5,9 @@ use burn::tensor::{Device, Tensor, TensorData};
 use image::{DynamicImage, RgbImage};
 use rayon::prelude::*;
 
-use crate::EvalError;
 use crate::preview::picture;
 use crate::region::Region;
+use crate::{EvalError, Result};
 
 /// One picture.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,12 +28,12 @@ impl Picture {
     ///
     /// # Panics
     /// If the number of values does not fit the size.
-    pub fn new(values: Vec<f32>, [height, width]: [usize; 2], what: &'static str) -> Result<Self, EvalError> {
+    pub fn new(values: Vec<f32>, [height, width]: [usize; 2], what: &'static str) -> Result<Self> {
         assert_eq!(values.len(), 3 * height * width, "planes of {width}×{height}");
         if let Some(at) = values.iter().position(|v| !(0.0..=1.0).contains(v)) {
             let (row, column) = (at / width % height, at % width);
             let channel = at / (height * width);
-            return Err(EvalError::Message(format!(
+            return Err(EvalError::new(format!(
                 "value {} at channel {channel}, row {row}, column {column} of the {what}: must be 0 to 1",
                 values[at]
             )));
@@ -48,7 +48,7 @@ impl Picture {
     ///
     /// # Panics
     /// If the number of values does not fit the size, or if the size is no multiple of `times`.
-    pub fn rendered(values: &[f32], [height, width]: [usize; 2], times: usize) -> Result<Self, EvalError> {
+    pub fn rendered(values: &[f32], [height, width]: [usize; 2], times: usize) -> Result<Self> {
         assert_eq!(values.len(), 3 * height * width, "pixels of {width}×{height}");
         assert!(height % times == 0 && width % times == 0, "{width}×{height} in parts of {times}");
         let cut = |v: f32| if v.is_finite() { v.clamp(0.0, 1.0) } else { v };
@@ -72,7 +72,7 @@ impl Picture {
     ///
     /// # Errors
     /// [`EvalError::Message`] for files of floating-point numbers with other values.
-    pub fn from_file(picture: DynamicImage, what: &'static str) -> Result<Self, EvalError> {
+    pub fn from_file(picture: DynamicImage, what: &'static str) -> Result<Self> {
         let (width, height) = (picture.width() as usize, picture.height() as usize);
         // Without alpha every pixel has an alpha of 1.
         let picture = picture.into_rgba32f();

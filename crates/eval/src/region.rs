@@ -5,8 +5,8 @@ use std::ops::Range;
 
 use snapsnap_net::{Window, dilated};
 
-use crate::EvalError;
 use crate::pictures::Picture;
+use crate::{EvalError, Result};
 
 /// The paper's window, height and width at 1024 pixels.
 const PAPER: [usize; 2] = [1000, 500];
@@ -37,13 +37,12 @@ impl Region {
     ///
     /// # Errors
     /// [`EvalError::Message`] for a black picture.
-    pub fn paper(target: &Picture) -> Result<Self, EvalError> {
+    pub fn paper(target: &Picture) -> Result<Self> {
         let Picture { width, height, .. } = *target;
         let seen = |i: usize| (0..3).any(|c| target.plane(c)[i] != 0.0);
         let seen: Vec<bool> = (0..width * height).map(seen).collect();
         let Some(Window { rows, columns }) = Window::around([&seen[..]].into_iter(), width) else {
-            let message = "the true picture is black throughout: there is no person";
-            return Err(EvalError::Message(message.into()));
+            return Err(EvalError::new("the true picture is black throughout: there is no person"));
         };
         let side = |of: usize, most: usize| ((of * height + AT / 2) / AT).clamp(1, most);
         let [h, w] = [side(PAPER[0], height), side(PAPER[1], width)];
@@ -58,10 +57,10 @@ impl Region {
     ///
     /// # Errors
     /// [`EvalError::Message`] for a mask without a person.
-    pub fn masked(mask: &[f32], [_, width]: [usize; 2], margin: usize) -> Result<Self, EvalError> {
+    pub fn masked(mask: &[f32], [_, width]: [usize; 2], margin: usize) -> Result<Self> {
         let inside = dilated(&mask.iter().map(|v| *v > 0.0).collect::<Vec<_>>(), width, margin);
         let Some(Window { rows, columns }) = Window::around([&inside[..]].into_iter(), width) else {
-            return Err(EvalError::Message("the mask is empty: there is no person".into()));
+            return Err(EvalError::new("the mask is empty: there is no person"));
         };
         let window = [columns.start, rows.start, columns.len(), rows.len()];
         let line = |row: usize| &inside[row * width..][columns.clone()];

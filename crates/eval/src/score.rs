@@ -3,7 +3,7 @@
 use burn::tensor::ops::PadMode;
 use serde::{Deserialize, Serialize};
 
-use crate::EvalError;
+use crate::Result;
 use crate::lpips::{Lpips, MIN_SIDE};
 use crate::pictures::Picture;
 use crate::region::Region;
@@ -27,13 +27,8 @@ impl Score {
     /// a mask. The box of a mask that is smaller than [`MIN_SIDE`] is padded with black.
     ///
     /// # Errors
-    /// [`EvalError::Message`] if the sizes differ.
-    pub fn new(
-        image: &Picture,
-        target: &Picture,
-        region: &Region,
-        lpips: Option<&Lpips>,
-    ) -> Result<Self, EvalError> {
+    /// [`EvalError::Message`](crate::EvalError::Message) if the sizes differ.
+    pub fn new(image: &Picture, target: &Picture, region: &Region, lpips: Option<&Lpips>) -> Result<Self> {
         let (psnr, ssim) = (psnr(image, target, region)?, ssim(image, target, region)?);
         let [.., width, height] = region.window;
         let short = [width, height].map(|side| MIN_SIDE.saturating_sub(side));

@@ -5,9 +5,9 @@ use burn::tensor::ops::ConvOptions;
 use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
 
-use crate::EvalError;
 use crate::pictures::Picture;
 use crate::region::Region;
+use crate::{EvalError, Result};
 
 /// Side of the protocol's uniform window: scikit-image's default.
 const UNIFORM: usize = 7;
@@ -31,7 +31,7 @@ impl SquaredError {
     ///
     /// # Errors
     /// [`EvalError::Message`] if the sizes differ.
-    pub fn add(&mut self, image: &Picture, target: &Picture, region: &Region) -> Result<(), EvalError> {
+    pub fn add(&mut self, image: &Picture, target: &Picture, region: &Region) -> Result<()> {
         check_sizes(image, target)?;
         let [x, y, width, height] = region.window;
         for (channel, row) in (0..3).flat_map(|channel| (y..y + height).map(move |row| (channel, row))) {
@@ -54,7 +54,7 @@ impl SquaredError {
 ///
 /// # Errors
 /// [`EvalError::Message`] if the sizes differ.
-pub fn psnr(image: &Picture, target: &Picture, region: &Region) -> Result<f64, EvalError> {
+pub fn psnr(image: &Picture, target: &Picture, region: &Region) -> Result<f64> {
     let mut error = SquaredError::default();
     error.add(image, target, region)?;
     Ok(error.psnr())
@@ -64,12 +64,12 @@ pub fn psnr(image: &Picture, target: &Picture, region: &Region) -> Result<f64, E
 ///
 /// # Errors
 /// [`EvalError::Message`] if the sizes differ.
-pub fn check_sizes(image: &Picture, target: &Picture) -> Result<(), EvalError> {
+pub fn check_sizes(image: &Picture, target: &Picture) -> Result<()> {
     let size = |p: &Picture| format!("{}×{}", p.width, p.height);
     if size(image) == size(target) {
         return Ok(());
     }
-    Err(EvalError::Message(format!("the sizes differ: {} and {}", size(image), size(target))))
+    Err(EvalError::new(format!("the sizes differ: {} and {}", size(image), size(target))))
 }
 
 /// Structural similarity as scikit-image's `structural_similarity` computes it by default for values in [0, 1]:
@@ -79,7 +79,7 @@ pub fn check_sizes(image: &Picture, target: &Picture) -> Result<(), EvalError> {
 ///
 /// # Errors
 /// [`EvalError::Message`] if the sizes differ.
-pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option<f64>, EvalError> {
+pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option<f64>> {
     check_sizes(image, target)?;
     let [x, y, w, h] = region.window;
     let around = if region.inside.is_some() { UNIFORM / 2 } else { 0 };
@@ -100,7 +100,7 @@ pub fn ssim(image: &Picture, target: &Picture, region: &Region) -> Result<Option
 ///
 /// # Errors
 /// [`EvalError::Message`] if the sizes differ.
-pub fn ssim_of_loss(image: &Picture, target: &Picture, region: &Region) -> Result<f64, EvalError> {
+pub fn ssim_of_loss(image: &Picture, target: &Picture, region: &Region) -> Result<f64> {
     check_sizes(image, target)?;
     let window = Window { weights: gaussian(), correction: 1.0, padded: true };
     Ok(mean_in_region(image, target, [0, 0], region, &window).unwrap_or(f64::NAN))

@@ -149,17 +149,12 @@ fn bias(bias: &Option<Param<Tensor<1>>>) -> Option<Tensor<1>> {
 #[derive(Debug)]
 struct Operator<L> {
     layer: L,
-    shape: Vec<usize>,
     has_bias: bool,
 }
 
 impl<L: Layer> Kernel for Operator<L> {
-    fn shape(&self) -> Vec<usize> {
-        self.shape.clone()
-    }
-
     fn forward(&self, [x, weight, bias]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
-        let (out, kept) = self.layer.forward(x, weight, self.has_bias.then_some(bias), keep);
+        let (out, kept) = self.layer.forward([x, weight], self.has_bias.then_some(bias), keep);
         (out, keep.then(|| Box::new(kept) as _))
     }
 
@@ -179,6 +174,5 @@ fn run<const A: usize, const W: usize, const D: usize>(
 ) -> Tensor<D> {
     // Kernels read f32 and round the factors themselves.
     let (weight, bias) = (weight.cast(FloatDType::F32), bias.map(|bias| bias.cast(FloatDType::F32)));
-    let operator = Operator { layer, shape: shape.to_vec(), has_bias: bias.is_some() };
-    op::run(operator, x, Some(weight), bias)
+    op::run(Operator { layer, has_bias: bias.is_some() }, shape, x, Some(weight), bias)
 }

@@ -17,7 +17,6 @@ mod operators;
 pub mod orthogonal;
 pub mod regressor;
 mod resize;
-mod rope;
 mod rotary;
 mod vectors;
 mod winograd;
@@ -34,8 +33,7 @@ pub use device::{as_weight, has_kernels, host, is_bf16};
 pub use layers::linear_gelu;
 pub use mean_lengths::mean_lengths;
 pub use resize::bilinear;
-pub use rope::Rope;
-pub use rotary::{rotary_attention, rotary_self_attention};
+pub use rotary::{Rope, rotary_attention, rotary_self_attention};
 
 /// Sums over the last dimension in two steps: `[A, B, N]` → `[A, B, 1]`. A GPU uses one thread per sum of a step.
 pub fn sum_last(x: Tensor<3>) -> Tensor<3> {

@@ -25,7 +25,7 @@ pub fn mean_lengths(vectors: Tensor<4>, weight: Tensor<3>, offsets: &[[usize; 2]
         return plain(vectors, &weight, offsets);
     }
     let kernel = MeanLengths { batch, height, width, offsets: offsets.to_vec() };
-    op::run(kernel, vectors, Some(weight), None::<Tensor<1>>)
+    op::run(kernel, [batch, offsets.len()], vectors, Some(weight), None::<Tensor<1>>)
 }
 
 /// [`mean_lengths`] in Burn's operators.
@@ -90,10 +90,6 @@ impl MeanLengths {
 }
 
 impl Kernel for MeanLengths {
-    fn shape(&self) -> Vec<usize> {
-        vec![self.batch, self.offsets.len()]
-    }
-
     fn forward(&self, [vectors, weight, _]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let (area, count) = (self.area(), self.offsets.len());
         // Sums of lengths and numbers of pairs, row by row.

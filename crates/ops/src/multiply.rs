@@ -53,16 +53,10 @@ pub fn product(size: [usize; 3], lhs: Matrix, rhs: &Right, out: &mut [f32], add:
     }
 }
 
-fn product_in_bf16(
-    [m, n, k]: [usize; 3],
-    (values, [inner, row]): Matrix,
-    rhs: &[u32],
-    out: &mut [f32],
-    add: bool,
-) {
+fn product_in_bf16([m, n, k]: [usize; 3], lhs: Matrix, rhs: &[u32], out: &mut [f32], add: bool) {
     /// Words of the left factor that are packed at once: 128 KiB, which leaves second-level cache for a panel.
     const WORDS: usize = 32 * 1024;
-    let blocks = k.div_ceil(bf16::BLOCK);
+    let ((values, [inner, row]), blocks) = (lhs, k.div_ceil(bf16::BLOCK));
     let most = (WORDS / (blocks * bf16::PAIRS)).next_multiple_of(4 * bf16::PAIRS);
     for first in (0..m).step_by(most) {
         let values = &values[first * row..];

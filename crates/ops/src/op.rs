@@ -14,13 +14,10 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{
     AutodiffBackend, Backend, Dispatch, ExtensionType, Flex, TensorMetadata, backend_extension,
 };
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::{Shape, Tensor, TensorData};
 
 /// An operator on contiguous f32 values: up to three input tensors, one result.
 pub trait Kernel: Debug + Send + Sync + 'static {
-    /// Shape of the result.
-    fn shape(&self) -> Vec<usize>;
-
     /// The result, and with `keep` the values that the backward pass needs beside inputs. An absent input is one zero.
     fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept);
 
@@ -63,21 +60,21 @@ pub struct One<B: Backend> {
 /// Backends that run a [`Kernel`].
 #[backend_extension(Flex, Autodiff)]
 pub trait KernelBackend: Backend {
-    /// Runs `kernel`.
-    fn run(#[extension_type] inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> One<Self>;
+    /// Runs `kernel`, whose result has this `shape`.
+    fn run(#[extension_type] inputs: Inputs<Self>, kernel: Arc<dyn Kernel>, shape: Shape) -> One<Self>;
 }
 
 impl KernelBackend for Flex {
-    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> One<Self> {
-        One { tensor: forward(&inputs, &*kernel, false).0 }
+    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>, shape: Shape) -> One<Self> {
+        One { tensor: forward(&inputs, &*kernel, shape, false).0 }
     }
 }
 
 /// As [`Kernel::forward`].
-fn forward(inputs: &Inputs<Flex>, kernel: &dyn Kernel, keep: bool) -> (FlexTensor, Kept) {
+fn forward(inputs: &Inputs<Flex>, kernel: &dyn Kernel, shape: Shape, keep: bool) -> (FlexTensor, Kept) {
     let fields = contiguous(inputs);
     let (values, kept) = kernel.forward(fields.each_ref().map(slice), keep);
-    (FlexTensor::from_data(TensorData::new(values, kernel.shape())), kept)
+    (FlexTensor::from_data(TensorData::new(values, shape)), kept)
 }
 
 fn contiguous(inputs: &Inputs<Flex>) -> [FlexTensor; 3] {
@@ -119,7 +116,7 @@ impl Backward<Flex, 3> for KernelBackward {
 }
 
 impl<C: CheckpointStrategy> KernelBackend for Autodiff<Flex, C> {
-    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>) -> One<Self> {
+    fn run(inputs: Inputs<Self>, kernel: Arc<dyn Kernel>, shape: Shape) -> One<Self> {
         let nodes = [inputs.x.node(), inputs.y.node(), inputs.z.node()];
         let inputs = Inputs {
             x: inputs.x.into_primitive(),
@@ -128,18 +125,19 @@ impl<C: CheckpointStrategy> KernelBackend for Autodiff<Flex, C> {
         };
         let tensor = match KernelBackward.prepare::<C>(nodes).compute_bound().stateful() {
             OpsKind::Tracked(prepared) => {
-                let (tensor, kept) = forward(&inputs, &*kernel, true);
+                let (tensor, kept) = forward(&inputs, &*kernel, shape, true);
                 prepared.finish(Call { inputs, kernel, kept: Arc::new(Mutex::new(kept)) }, tensor)
             }
-            OpsKind::UnTracked(_) => Self::from_inner(forward(&inputs, &*kernel, false).0),
+            OpsKind::UnTracked(_) => Self::from_inner(forward(&inputs, &*kernel, shape, false).0),
         };
         One { tensor }
     }
 }
 
-/// Runs a kernel on tensors of `flex`, tracked or not.
+/// Runs a kernel, whose result has this `shape`, on tensors of `flex`, tracked or not.
 pub fn run<const A: usize, const B: usize, const C: usize, const D: usize>(
     kernel: impl Kernel,
+    shape: [usize; D],
     x: Tensor<A>,
     y: Option<Tensor<B>>,
     z: Option<Tensor<C>>,
@@ -151,5 +149,5 @@ pub fn run<const A: usize, const B: usize, const C: usize, const D: usize>(
         y: y.map_or_else(none, Tensor::into_dispatch),
         z: z.map_or_else(none, Tensor::into_dispatch),
     };
-    Tensor::from_dispatch(<Dispatch as KernelBackend>::run(inputs, Arc::new(kernel)).tensor)
+    Tensor::from_dispatch(<Dispatch as KernelBackend>::run(inputs, Arc::new(kernel), shape.into()).tensor)
 }

@@ -17,11 +17,12 @@ use crate::vectors::vectorized;
 /// `align_corners`: the outermost samples coincide (inside the DPT head). Otherwise the outer edges of the pixels
 /// coincide (everywhere else). [0, 1] becomes [0, ⅓, ⅔, 1] or [0, ¼, ¾, 1] (docs/method.md, "Check values").
 pub fn bilinear(x: Tensor<4>, size: [usize; 2], align_corners: bool) -> Tensor<4> {
-    let ([_, _, h, w], device) = (x.dims(), x.device());
+    let ([b, c, h, w], device) = (x.dims(), x.device());
     let [down, across] = [(h, size[0]), (w, size[1])].map(|(from, to)| taps(from, to, align_corners));
     if has_kernels(&x) {
         let none: Option<Tensor<1>> = None;
-        return op::run(Resize { from: x.dims(), down, across }, x, none.clone(), none);
+        let kernel = Resize { from: [b, c, h, w], down, across };
+        return op::run(kernel, [b, c, size[0], size[1]], x, none.clone(), none);
     }
     if device.is_autodiff() {
         // Burn's own operator has no backward pass on GPUs. Products with constant matrices have one.
@@ -51,10 +52,6 @@ struct Resize {
 }
 
 impl Kernel for Resize {
-    fn shape(&self) -> Vec<usize> {
-        vec![self.from[0], self.from[1], self.down.len(), self.across.len()]
-    }
-
     fn forward(&self, [x, ..]: [&[f32]; 3], _keep: bool) -> (Vec<f32>, Kept) {
         let [batch, channels, rows, columns] = self.from;
         let (width, size) = (self.across.len(), self.down.len() * self.across.len());
@@ -98,10 +95,7 @@ impl Kernel for Resize {
                     sum.fill(0.0);
                     for &(from, weight) in uses {
                         let line = &gradient[from * width..][..width];
-                        vectorized(
-                            #[inline(always)]
-                            || sum.iter_mut().zip(line).for_each(|(sum, x)| *sum += weight * x),
-                        );
+                        vectorized!(|| sum.iter_mut().zip(line).for_each(|(sum, x)| *sum += weight * x));
                     }
                     for (out, uses) in out.iter_mut().zip(&across) {
                         *out = uses.iter().map(|&(from, weight)| weight * sum[from]).sum();

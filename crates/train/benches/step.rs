@@ -8,14 +8,14 @@
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
-use burn::module::{Module, Param, ParamGroup, ParamId};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Distribution, Tensor};
 use snapsnap_base::config::Schema;
-use snapsnap_net::network::{Input, PointPredictor};
+use snapsnap_net::network::Input;
 use snapsnap_net::precision::Precision;
-use snapsnap_net::weights::{NamedVisitor, ParameterPath, random_predictor, random_regressors, visit_named};
+use snapsnap_net::weights::{random_predictor, random_regressors};
 use snapsnap_train::config::TrainConfig;
+use snapsnap_train::networks::Networks;
 
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
@@ -46,22 +46,6 @@ fn main() {
     rayon::scope(|_| run(seconds, side, batch));
 }
 
-/// The predictor with frozen parameters, except those whose names begin with one of `trained`.
-fn frozen(predictor: PointPredictor, trained: &[&str]) -> PointPredictor {
-    struct Frozen<'a>(&'a [&'a str], Vec<ParamId>);
-    impl NamedVisitor for Frozen<'_> {
-        fn visit<const D: usize>(&mut self, path: &ParameterPath, parameter: &Param<Tensor<D>>) {
-            let name = path.name();
-            if !self.0.iter().any(|part| name.starts_with(part)) {
-                self.1.push(parameter.id);
-            }
-        }
-    }
-    let mut frozen = Frozen(trained, Vec::new());
-    visit_named(&predictor, "", &mut frozen);
-    if frozen.1.is_empty() { predictor } else { predictor.freeze_group(ParamGroup::from_ids(frozen.1)) }
-}
-
 fn asked_for(word: &str) -> bool {
     std::env::args().any(|argument| argument == word)
 }
@@ -85,7 +69,8 @@ fn run(seconds: f64, side: usize, batch: usize) {
         [n.enc_dim, n.dec_dim, n.last_dim] = [n.enc_dim, n.dec_dim, n.last_dim].map(|width| 2 * width);
     }
     let precision = if asked_for("bf16") { Precision::Bf16 } else { Precision::F32 };
-    let masters = random_predictor(&config, 1, &device);
+    let predictor = Some(random_predictor(&config, 1, &device));
+    let masters = Networks { predictor, regressors: Vec::new() };
     let regressor = random_regressors(&config, 1, &device).remove(0);
     let threads = rayon::current_num_threads();
 
@@ -103,11 +88,11 @@ fn run(seconds: f64, side: usize, batch: usize) {
         if asked_for("regressor") || (!trained.is_empty() && asked_for("whole")) {
             continue;
         }
-        let masters = frozen(masters.clone(), &trained.split(',').collect::<Vec<_>>());
+        let masters = masters.clone().with_trained(&trained.split(',').collect::<Vec<_>>());
         let grid = [side / config.network.patch; 2];
         let time = measure(seconds, || {
             let start = Instant::now();
-            let predictor = precision.lower(masters.clone());
+            let predictor = masters.in_precision(precision).predictor.expect("the predictor");
             let input = Input { images: images.clone(), grid };
             let raw = predictor.raw(&predictor.decode(predictor.encode(input)));
             let loss = Tensor::cat(raw.into_iter().map(|raw| raw.square().mean()).collect(), 0).sum();

@@ -8,7 +8,7 @@ use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use snapsnap_base::FileError;
 use snapsnap_net::config::Precision;
-use snapsnap_net::weights::{Source, WeightsError, not_finite, write_tensors};
+use snapsnap_net::weights::{Source, not_finite, write_tensors};
 use snapsnap_ops::host;
 
 use crate::config::MAX_STEPS;
@@ -16,6 +16,7 @@ use crate::identity::Identity;
 use crate::learner::{Learner, Progress};
 use crate::networks::{Rows, row};
 use crate::task::Task;
+use crate::{Result, TrainError};
 
 /// Metadata key of the record, as JSON.
 const RECORD_KEY: &str = "snapsnap.training";
@@ -29,11 +30,7 @@ struct Record {
 }
 
 /// Writes the state of a run. After an error, the former file stays.
-pub(crate) fn save<T: Task>(
-    path: &Path,
-    learner: &Learner<T>,
-    identity: &Identity,
-) -> Result<(), WeightsError> {
+pub(crate) fn save<T: Task>(path: &Path, learner: &Learner<T>, identity: &Identity) -> Result<()> {
     let (mut rows, times) = learner.optimizer.record();
     let progress = Progress { times, ..learner.progress.clone() };
     let mut add = |kind: &str, new: Rows| {
@@ -50,16 +47,13 @@ pub(crate) fn save<T: Task>(
     // Only one row at a time is copied to the host.
     let rows: Vec<_> = rows.into_values().collect();
     let values = |i: usize| Ok(host(rows[i].clone()));
-    write_tensors(path, "the state of the training", metadata, names, Precision::F32, values, &|_, _| ())
+    let what = "the state of the training";
+    Ok(write_tensors(path, what, metadata, names, Precision::F32, values, &|_, _| ())?)
 }
 
 /// Restores a learner of the same networks from the state of a run, and returns the run's identity.
-pub(crate) fn load<T: Task>(
-    path: &Path,
-    learner: &mut Learner<T>,
-    device: &Device,
-) -> Result<Identity, WeightsError> {
-    let wrong = |message: String| WeightsError::from(FileError::unsuitable(path, message));
+pub(crate) fn load<T: Task>(path: &Path, learner: &mut Learner<T>, device: &Device) -> Result<Identity> {
+    let wrong = |message: String| TrainError::from(FileError::unsuitable(path, message));
     let source = Source::open(path)?;
     let text = source.metadata.get(RECORD_KEY).ok_or_else(|| wrong("is no state of a training".into()))?;
     let Record { progress, run } =
@@ -71,7 +65,7 @@ pub(crate) fn load<T: Task>(
         return Err(wrong(format!("is damaged: it tells of {} steps", progress.step)));
     }
     let read = |name: &String| Ok((name.clone(), source.read_f32(name)?));
-    let mut rows = source.tensors().keys().map(read).collect::<Result<BTreeMap<_, _>, WeightsError>>()?;
+    let mut rows = source.tensors().keys().map(read).collect::<Result<BTreeMap<_, _>>>()?;
     let has_averages = rows.keys().any(|key| key.starts_with("average/"));
     let shapes = learner.networks.shapes();
     for (key, values) in &rows {
@@ -83,7 +77,7 @@ pub(crate) fn load<T: Task>(
             return Err(wrong(problem));
         }
     }
-    let mut take = |kind: &str| -> Result<Rows, WeightsError> {
+    let mut take = |kind: &str| -> Result<Rows> {
         let one = |name: &String| {
             let values = rows.remove(&format!("{kind}/{name}"));
             let values = values.ok_or_else(|| wrong(format!("{kind}/{name} is missing")))?;

@@ -172,16 +172,12 @@ impl TrainConfig {
         let details = self.network.details.as_ref();
         let is_used = details.is_some_and(|details| details.resolution <= self.network.resolution);
         if self.stage1.only_details && !is_used {
-            return refuse(
-                "stage1.only_details",
-                "needs `network.details`, whose resolution is at most the canvas'",
-            );
+            let message = "needs `network.details`, whose resolution is at most the canvas'";
+            return refuse("stage1.only_details", message);
         }
         if t.precision == Precision::F16 {
-            return refuse(
-                "training.precision",
-                "must be \"f32\" or \"bf16\": small gradients vanish in f16",
-            );
+            let message = "must be \"f32\" or \"bf16\": small gradients vanish in f16";
+            return refuse("training.precision", message);
         }
         if self.network.conf_mode != ConfMode::Sigmoid {
             return refuse("network.conf_mode", "must be \"sigmoid\" to be trained");

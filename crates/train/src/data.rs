@@ -10,9 +10,9 @@ use snapsnap_base::FileError;
 use snapsnap_data::dataset::{Folder, Split};
 use snapsnap_data::sample::{Augment, SampleConfig, Stage};
 
-use crate::TrainError;
 use crate::config::TrainConfig;
 use crate::ranks::Ranks;
+use crate::{Result, TrainError};
 
 /// The samples of a training and of its validations, from all data sets.
 pub struct Data<I> {
@@ -31,7 +31,7 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
         config: &TrainConfig,
         samples: &SampleConfig,
         new: impl Fn(Arc<Folder>, Option<Split>, SampleConfig) -> Result<Stage<I>, FileError>,
-    ) -> Result<Self, TrainError> {
+    ) -> Result<Self> {
         let mut training = Vec::new();
         for folder in folders {
             let (there, needed) = (folder.description().resolution as usize, config.network.resolution);
@@ -80,8 +80,8 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
     pub(crate) fn validated<S: Clone + Default + Serialize + DeserializeOwned>(
         &self,
         ranks: &Ranks,
-        mut add: impl FnMut(&mut S, I) -> Result<(), TrainError>,
-    ) -> Result<Vec<S>, TrainError> {
+        mut add: impl FnMut(&mut S, I) -> Result<()>,
+    ) -> Result<Vec<S>> {
         let mut sum = S::default();
         let mut share = ranks.share(self.count);
         let failed = share.try_for_each(|place| add(&mut sum, self.validated_item(place, self.count)?)).err();
@@ -90,13 +90,13 @@ impl<I: Clone + Send + Sync + 'static> Data<I> {
     }
 
     /// At most `count` samples of the validation, spread over all data sets.
-    pub(crate) fn validation(&self, count: usize) -> impl Iterator<Item = Result<I, TrainError>> {
+    pub(crate) fn validation(&self, count: usize) -> impl Iterator<Item = Result<I>> {
         let count = count.min(self.count);
         (0..count).map(move |place| self.validated_item(place, count))
     }
 
     /// One of `count` samples that are spread over all data sets.
-    fn validated_item(&self, place: usize, count: usize) -> Result<I, TrainError> {
+    fn validated_item(&self, place: usize, count: usize) -> Result<I> {
         let item = self.validation.get(place * self.validation.len() / count);
         item.map_err(|e| TrainError::Unsuitable(e.to_string()))
     }

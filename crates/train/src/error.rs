@@ -31,3 +31,6 @@ pub enum TrainError {
     #[allow(missing_docs, reason = "the names say it")]
     Stuck { count: u64, step: u64, why: String },
 }
+
+/// The result of a part of a training.
+pub type Result<T, E = TrainError> = std::result::Result<T, E>;

@@ -28,30 +28,25 @@ pub fn collect(networks: &Networks, gradients: &mut Gradients) -> Rows {
     collect.rows
 }
 
-/// Sums of all ranks' gradients, on a device. A rank may lack some gradients. `lengths` are the numbers of values of
+/// Sums of all ranks' gradients, on a device. A rank may lack some gradients. `sizes` are the numbers of values of
 /// all parameters, which are the same on all ranks.
-pub fn reduce(
-    ranks: &Ranks,
-    mut gradients: Rows,
-    lengths: &BTreeMap<String, usize>,
-    device: &Device,
-) -> Rows {
+pub fn reduce(ranks: &Ranks, mut gradients: Rows, sizes: &BTreeMap<String, usize>, device: &Device) -> Rows {
     /// Values that are summed at once.
     const BUCKET: usize = 1 << 22;
     if ranks.size == 1 {
         return moved(gradients, device);
     }
-    let present: Vec<bool> = lengths.keys().map(|name| gradients.contains_key(name)).collect();
+    let present: Vec<bool> = sizes.keys().map(|name| gradients.contains_key(name)).collect();
     let everywhere = ranks.gather(&present);
     let is_present = |place: usize| everywhere.iter().any(|present| present[place]);
     let mut sums = Rows::new();
     let (mut bucket, mut inside) = (Vec::new(), Vec::new());
-    for (place, (name, length)) in lengths.iter().enumerate() {
+    for (place, (name, length)) in sizes.iter().enumerate() {
         if is_present(place) {
             bucket.extend(gradients.remove(name).map_or_else(|| vec![0.0; *length], host));
             inside.push((name.clone(), *length));
         }
-        if !inside.is_empty() && (bucket.len() >= BUCKET || place + 1 == lengths.len()) {
+        if !inside.is_empty() && (bucket.len() >= BUCKET || place + 1 == sizes.len()) {
             ranks.sum(&mut bucket);
             sums.extend(split(std::mem::take(&mut inside), &bucket, device));
             bucket.clear();

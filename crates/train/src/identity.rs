@@ -10,7 +10,7 @@ use snapsnap_base::config::{differences, keys};
 use snapsnap_data::dataset::Folder;
 use snapsnap_data::dataset::Split::{self, Train, Val};
 
-use crate::TrainError;
+use crate::Result;
 use crate::config::TrainConfig;
 use crate::task::Task;
 
@@ -52,8 +52,8 @@ impl Identity {
     /// The identity of a run of `task`.
     ///
     /// # Errors
-    /// [`TrainError::File`] if a file of a data set cannot be read.
-    pub fn of<T: Task>(task: &T, config: &TrainConfig) -> Result<Self, TrainError> {
+    /// [`TrainError::File`](crate::TrainError::File) if a file of a data set cannot be read.
+    pub fn of<T: Task>(task: &T, config: &TrainConfig) -> Result<Self> {
         let mut own = keys(config);
         own.retain(|key, _| !FREE.contains(&key.as_str()));
         let folders = &task.data().folders;

@@ -18,7 +18,7 @@ use crate::networks::{Networks, Rows};
 use crate::optimizer::Optimizer;
 use crate::ranks::Ranks;
 use crate::task::{Moment, Task};
-use crate::{TrainError, gradients};
+use crate::{Result, TrainError, gradients};
 
 /// Largest norm of all gradients together, as published. Larger gradients are scaled down to it.
 const MAX_NORM: f64 = 1.0;
@@ -107,7 +107,7 @@ impl<'a, T: Task> Learner<'a, T> {
     ///
     /// # Errors
     /// [`TrainError::Unsuitable`] if not.
-    pub fn compare(&self, identity: &Identity) -> Result<(), TrainError> {
+    pub fn compare(&self, identity: &Identity) -> Result<()> {
         if self.ranks.size == 1 {
             return Ok(());
         }
@@ -143,7 +143,7 @@ impl<'a, T: Task> Learner<'a, T> {
     ///
     /// # Errors
     /// [`TrainError`] if the training cannot continue.
-    pub fn step(&mut self) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
+    pub fn step(&mut self) -> Result<Result<BTreeMap<String, f64>, Skipped>> {
         let step = self.progress.step;
         let made = self.update(step)?;
         self.progress.step += 1;
@@ -156,7 +156,7 @@ impl<'a, T: Task> Learner<'a, T> {
         Ok(made)
     }
 
-    fn update(&mut self, step: u64) -> Result<Result<BTreeMap<String, f64>, Skipped>, TrainError> {
+    fn update(&mut self, step: u64) -> Result<Result<BTreeMap<String, f64>, Skipped>> {
         let Loaded { items, first, count } = match self.load(step) {
             Ok(loaded) => loaded,
             // The reason names the damaged file.
@@ -216,7 +216,7 @@ impl<'a, T: Task> Learner<'a, T> {
     }
 
     /// Losses and gradients of a part of a batch, times the part's share of the batch.
-    fn losses(&self, items: Vec<T::Item>, at: Moment, share: f64) -> Result<Made, TrainError> {
+    fn losses(&self, items: Vec<T::Item>, at: Moment, share: f64) -> Result<Made> {
         let nothing = Ok((BTreeMap::new(), Rows::new()));
         // There may be more ranks than samples in the last batch of a pass.
         if items.is_empty() {

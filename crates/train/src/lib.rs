@@ -22,4 +22,4 @@ pub mod stage1;
 pub mod stage2;
 pub mod task;
 
-pub use error::TrainError;
+pub use error::{Result, TrainError};

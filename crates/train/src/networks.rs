@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_net::config::Precision;
 use snapsnap_net::network::PointPredictor;
 use snapsnap_net::regressor::Regressor;
-use snapsnap_net::weights::schema::{DETAILS, SIDE};
+use snapsnap_net::weights::schema::SIDE;
 use snapsnap_net::weights::{NamedMapper, NamedVisitor, ParameterPath, map_named, visit_named};
 use snapsnap_ops::host;
 
@@ -34,19 +34,20 @@ pub(crate) struct Parameter {
 pub type Rows = BTreeMap<String, Tensor<1>>;
 
 impl Networks {
-    /// The same networks, of which only the network of details is trained.
-    pub fn with_trained_details(self) -> Self {
-        struct Freeze;
-        impl NamedMapper for Freeze {
+    /// The same networks, of which only the parameters whose names begin with one of `parts` are trained.
+    pub fn with_trained(self, parts: &[&str]) -> Self {
+        struct Freeze<'a>(&'a [&'a str]);
+        impl NamedMapper for Freeze<'_> {
             fn map<const D: usize>(
                 &mut self,
                 path: &ParameterPath,
                 param: Param<Tensor<D>>,
             ) -> Param<Tensor<D>> {
-                param.set_require_grad(path.name().starts_with(DETAILS))
+                let name = path.name();
+                param.set_require_grad(self.0.iter().any(|part| name.starts_with(part)))
             }
         }
-        self.map(&mut Freeze)
+        self.map(&mut Freeze(parts))
     }
 
     /// Visits all parameters.
@@ -73,9 +74,8 @@ impl Networks {
     /// intermediate results for the backward pass. Gradients flow back to these networks. Weights, moments and losses
     /// stay in 32 bits.
     pub fn in_precision(&self, precision: Precision) -> Self {
-        let mut networks = self.clone();
-        networks.predictor = networks.predictor.map(|predictor| precision.lower(predictor));
-        networks
+        let Self { predictor, regressors } = self.clone();
+        Self { predictor: predictor.map(|predictor| precision.lower(predictor)), regressors }
     }
 
     /// All parameters with their values, without gradients.

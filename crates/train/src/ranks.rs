@@ -7,7 +7,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use snapsnap_data::sample::share;
 
-use crate::TrainError;
+use crate::{Result, TrainError};
 
 /// Environment variables that MPI launchers set: Open MPI, PMIx, and MPICH or Slurm's PMI-2.
 const LAUNCHERS: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMIX_RANK", "PMI_RANK"];
@@ -98,7 +98,7 @@ impl Ranks {
     ///
     /// # Errors
     /// [`TrainError`] if any rank failed.
-    pub fn agree(&self, failed: Option<TrainError>) -> Result<(), TrainError> {
+    pub fn agree(&self, failed: Option<TrainError>) -> Result<()> {
         let own = failed.as_ref().map(|e| (e.to_string(), self.host.clone()));
         let first =
             self.gather(&own).into_iter().enumerate().find_map(|(rank, failure)| Some((rank, failure?)));

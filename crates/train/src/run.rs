@@ -13,7 +13,6 @@ use snapsnap_base::{FileError, file};
 use snapsnap_eval::preview;
 use snapsnap_net::weights;
 
-use crate::TrainError;
 use crate::checkpoint;
 use crate::config::TrainConfig;
 use crate::identity::Identity;
@@ -22,6 +21,7 @@ use crate::log::{self, Line, Log, PREVIEWS};
 use crate::networks::Networks;
 use crate::ranks::Ranks;
 use crate::task::{Task, Validation};
+use crate::{Result, TrainError};
 
 /// Number of failed steps in a row after which a run ends.
 const MAX_FAILURES: u64 = 20;
@@ -63,9 +63,9 @@ pub trait Watch {
     /// A step was logged. `steps` is the number of steps of the run, `skipped` the number of skipped steps so far.
     fn step(&mut self, line: &Line, steps: u64, skipped: u64);
     /// A validation was made after `step` steps.
-    fn validated(&mut self, step: u64, validation: &Validation);
+    fn validated(&mut self, _step: u64, _validation: &Validation) {}
     /// A message for the user.
-    fn note(&mut self, message: &str);
+    fn note(&mut self, _message: &str) {}
 }
 
 /// Outcome of a session.
@@ -93,7 +93,7 @@ pub fn train<T: Task>(
     networks: Networks,
     options: &Options,
     watch: &mut dyn Watch,
-) -> Result<Outcome, TrainError> {
+) -> Result<Outcome> {
     let mut session = Session::start(task, config, networks, options, watch)?;
     let steps = config.training.steps as u64;
     let first = session.learner.progress.step;
@@ -139,7 +139,7 @@ pub fn rehearse<T: Task>(
     networks: Networks,
     device: &Device,
     ranks: &Ranks,
-) -> Result<Rehearsal, TrainError> {
+) -> Result<Rehearsal> {
     /// First steps, which allocate memory and compile GPU kernels, and measured steps.
     const STEPS: [u32; 2] = [5, 5];
     let mut learner = Learner::new(task, config, networks, device, ranks);
@@ -182,7 +182,7 @@ impl<'a, T: Task> Session<'a, T> {
         networks: Networks,
         options: &'a Options<'a>,
         watch: &'a mut dyn Watch,
-    ) -> Result<Self, TrainError> {
+    ) -> Result<Self> {
         let mut learner = Learner::new(task, config, networks, options.device, options.ranks);
         let state = options.folder.join(STATE);
         let identity = Identity::of(task, config)?;
@@ -195,7 +195,7 @@ impl<'a, T: Task> Session<'a, T> {
                 Err(damaged) => {
                     let former = options.folder.join(FORMER);
                     let Ok(there) = checkpoint::load(&former, &mut learner, &device) else {
-                        return Err(damaged.into());
+                        return Err(damaged);
                     };
                     watch.note(&format!("{damaged}; the run goes on from the state before it"));
                     there
@@ -258,7 +258,7 @@ impl<'a, T: Task> Session<'a, T> {
     }
 
     /// One step, and the validation, preview and checkpoint that are due after it.
-    fn step(&mut self) -> Result<(), TrainError> {
+    fn step(&mut self) -> Result<()> {
         let t = &self.learner.config.training;
         // A failed step leaves the learner unchanged, so that its state can be saved.
         let made = self.learner.step().or_else(|failed| self.save_last().and(Err(failed)))?;
@@ -295,7 +295,7 @@ impl<'a, T: Task> Session<'a, T> {
     }
 
     /// The final validation and preview of a run, and the files of every session.
-    fn finish(&mut self) -> Result<(), TrainError> {
+    fn finish(&mut self) -> Result<()> {
         let is_last = self.learner.progress.step >= self.learner.config.training.steps as u64;
         let shown = if is_last { self.validate().and_then(|()| self.preview()) } else { Ok(()) };
         if is_last && shown.is_ok() {
@@ -306,14 +306,14 @@ impl<'a, T: Task> Session<'a, T> {
     }
 
     /// Saves before the session ends. No rank ends before the first one has written.
-    fn save_last(&mut self) -> Result<(), TrainError> {
+    fn save_last(&mut self) -> Result<()> {
         self.save()?;
         self.options.ranks.gather(&());
         Ok(())
     }
 
     /// Turns the error of a sample into a note. The validation or preview is lost, but the run continues.
-    fn spared(&mut self, what: &str, shown: Result<(), TrainError>) -> Result<(), TrainError> {
+    fn spared(&mut self, what: &str, shown: Result<()>) -> Result<()> {
         match shown {
             Err(e @ (TrainError::Unsuitable(_) | TrainError::Splat(_) | TrainError::Elsewhere(_))) => {
                 let step = self.learner.progress.step;
@@ -324,7 +324,7 @@ impl<'a, T: Task> Session<'a, T> {
         }
     }
 
-    fn report(&mut self, mut values: BTreeMap<String, f64>) -> Result<(), TrainError> {
+    fn report(&mut self, mut values: BTreeMap<String, f64>) -> Result<()> {
         let (t, now, step) = (&self.learner.config.training, Instant::now(), self.learner.progress.step);
         let rate = (step - self.logged.1) as f64 / (now - self.logged.0).as_secs_f64().max(1e-9);
         self.logged = (now, step);
@@ -335,11 +335,11 @@ impl<'a, T: Task> Session<'a, T> {
         self.add(line)
     }
 
-    fn add(&mut self, line: Line) -> Result<(), TrainError> {
+    fn add(&mut self, line: Line) -> Result<()> {
         Ok(self.log.as_mut().map_or(Ok(()), |log| log.add(line))?)
     }
 
-    fn validate(&mut self) -> Result<(), TrainError> {
+    fn validate(&mut self) -> Result<()> {
         let (networks, step) = (self.learner.averaged(), self.learner.progress.step);
         let validation = self.learner.task.validate(&networks, self.options.ranks)?;
         let Some(validation) = validation else { return Ok(()) };
@@ -359,7 +359,7 @@ impl<'a, T: Task> Session<'a, T> {
         Ok(())
     }
 
-    fn preview(&mut self) -> Result<(), TrainError> {
+    fn preview(&mut self) -> Result<()> {
         let Some(log) = &mut self.log else { return Ok(()) };
         let Some(sheet) = self.learner.task.preview(&self.learner.averaged())? else { return Ok(()) };
         let folder = self.options.folder.join(PREVIEWS);
@@ -370,7 +370,7 @@ impl<'a, T: Task> Session<'a, T> {
     }
 
     /// Writes weights, state and curves. Weights are first, so that every state has its weights.
-    fn save(&mut self) -> Result<(), TrainError> {
+    fn save(&mut self) -> Result<()> {
         self.learner.compare(&self.identity)?;
         let Some(log) = &self.log else { return Ok(()) };
         write_weights(&self.learner, &self.learner.averaged(), &self.options.folder.join(LAST))?;
@@ -381,13 +381,13 @@ impl<'a, T: Task> Session<'a, T> {
 }
 
 /// Writes `networks` and the frozen predictor.
-fn write_weights<T: Task>(learner: &Learner<T>, networks: &Networks, path: &Path) -> Result<(), TrainError> {
+fn write_weights<T: Task>(learner: &Learner<T>, networks: &Networks, path: &Path) -> Result<()> {
     let mut values = networks.checkpoint();
     values.extend(learner.task.frozen());
     Ok(weights::save(&learner.config.networks(), &values, path)?)
 }
 
-fn save_state<T: Task>(path: &Path, learner: &Learner<T>, identity: &Identity) -> Result<(), TrainError> {
+fn save_state<T: Task>(path: &Path, learner: &Learner<T>, identity: &Identity) -> Result<()> {
     let folder = path.parent().expect("lies in a folder");
     fs::create_dir_all(folder).map_err(FileError::write(folder))?;
     let [next, former] = ["next", "former"].map(|name| path.with_file_name(format!("{name}.safetensors")));

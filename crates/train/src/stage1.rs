@@ -15,7 +15,7 @@ use snapsnap_net::steps::Record;
 use snapsnap_net::{Prediction, Window};
 use snapsnap_ops::host;
 
-use crate::TrainError;
+use crate::Result;
 use crate::config::{Stage1Config, TrainConfig};
 use crate::data::Data;
 use crate::details;
@@ -48,8 +48,8 @@ impl PointTask {
     /// A training on these data sets and a device with gradients.
     ///
     /// # Errors
-    /// [`TrainError`] if a data set cannot be used with this config.
-    pub fn new(folders: &[Arc<Folder>], config: &TrainConfig, device: &Device) -> Result<Self, TrainError> {
+    /// [`TrainError`](crate::TrainError) if a data set cannot be used with this config.
+    pub fn new(folders: &[Arc<Folder>], config: &TrainConfig, device: &Device) -> Result<Self> {
         Ok(Self {
             networks: config.networks(),
             losses: config.stage1.clone(),
@@ -93,12 +93,7 @@ impl Task for PointTask {
         extents.reduce(|all, extent| all.united(&extent))
     }
 
-    fn losses(
-        &self,
-        networks: &Networks,
-        items: Vec<Stage1Item>,
-        at: Moment,
-    ) -> Result<Vec<Part>, TrainError> {
+    fn losses(&self, networks: &Networks, items: Vec<Stage1Item>, at: Moment) -> Result<Vec<Part>> {
         let batch = Stage1Batch::new(items, &self.device);
         if self.losses.only_details {
             let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
@@ -109,7 +104,7 @@ impl Task for PointTask {
         Ok(losses(&prediction, &batch.points, &batch.valid, relief).parts(&self.losses))
     }
 
-    fn validate(&self, networks: &Networks, ranks: &Ranks) -> Result<Option<Validation>, TrainError> {
+    fn validate(&self, networks: &Networks, ranks: &Ranks) -> Result<Option<Validation>> {
         if self.data.count == 0 {
             return Ok(None);
         }
@@ -120,7 +115,7 @@ impl Task for PointTask {
         Ok(Some(all.iter().fold(Errors::default(), |sum, errors| sum.plus(errors)).validation()))
     }
 
-    fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
+    fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>> {
         let mut rows: Vec<Vec<RgbImage>> = Vec::new();
         for item in self.data.validation(PREVIEWS) {
             let item = item?;

@@ -6,7 +6,7 @@ use burn::tensor::Tensor;
 use image::RgbImage;
 use snapsnap_net::Window;
 
-use crate::TrainError;
+use crate::Result;
 use crate::data::Data;
 use crate::networks::Networks;
 use crate::ranks::Ranks;
@@ -65,28 +65,23 @@ pub trait Task: Sync {
     /// losses, weighted with their numbers of samples. Empty if no sample shows a person.
     ///
     /// # Errors
-    /// [`TrainError`] if the batch cannot be used.
-    fn losses(
-        &self,
-        networks: &Networks,
-        items: Vec<Self::Item>,
-        at: Moment,
-    ) -> Result<Vec<Part>, TrainError>;
+    /// [`TrainError`](crate::TrainError) if the batch cannot be used.
+    fn losses(&self, networks: &Networks, items: Vec<Self::Item>, at: Moment) -> Result<Vec<Part>>;
 
     /// Compares predictions for held-out people with the ground truth; `None` without such people. `networks` have no
     /// gradients. Ranks share the samples, and all get the same result.
     ///
     /// # Errors
-    /// [`TrainError`] if a sample cannot be read.
-    fn validate(&self, _networks: &Networks, _ranks: &Ranks) -> Result<Option<Validation>, TrainError> {
+    /// [`TrainError`](crate::TrainError) if a sample cannot be read.
+    fn validate(&self, _networks: &Networks, _ranks: &Ranks) -> Result<Option<Validation>> {
         Ok(None)
     }
 
     /// A picture of the predictions for a few samples. `networks` are as in [`Self::validate`].
     ///
     /// # Errors
-    /// [`TrainError`] if a sample cannot be read.
-    fn preview(&self, _networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
+    /// [`TrainError`](crate::TrainError) if a sample cannot be read.
+    fn preview(&self, _networks: &Networks) -> Result<Option<RgbImage>> {
         Ok(None)
     }
 

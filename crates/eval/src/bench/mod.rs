@@ -1,19 +1,19 @@
 //! Error against run time: the evaluation of several variants of a model, with time and memory.
 
 pub mod config;
-mod oracle;
 pub mod report;
 
 use std::time::{Duration, Instant};
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use snapsnap_base::FileError;
 use snapsnap_net::weights::WeightFile;
-use snapsnap_splat::{Camera, Gaussians, scene};
+use snapsnap_ops::host;
+use snapsnap_splat::reference::{self, Cutoff, Scene};
+use snapsnap_splat::{Camera, Gaussians, RenderOptions, render, scene};
 
-use crate::EvalError;
 use crate::evaluate::model::Model;
 use crate::evaluate::person::{People, photograph};
 use crate::evaluate::{Contestant, Kind, by_person, evaluate, rendered};
@@ -21,11 +21,14 @@ use crate::lpips::Lpips;
 use crate::score::Score;
 use crate::statistics::{Interval, difference, interval, mean, quantile_of_times};
 use crate::variant::Variant;
+use crate::{EvalError, Result};
 
 use config::BenchConfig;
 
 /// Largest number of timed readings and of timed renders.
 const FEW: usize = 5;
+/// Largest α of a splat in the oracle without cut-offs.
+const WHOLE: f32 = 0.999_99;
 
 /// Costs and errors of a variant.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -104,17 +107,17 @@ pub fn measure(
     (device, device_name): (&Device, &str),
     (lpips, lpips_weights): (Option<&Lpips>, &str),
     most_used: &dyn Fn() -> Option<u64>,
-) -> Result<Measured, EvalError> {
+) -> Result<Measured> {
     let runs = config.bench.runs;
     let mut eval = config.evaluation(variant);
     let folder = variant.data.as_ref().or(config.data.folders.first());
-    let folder = folder.ok_or_else(|| EvalError::Message("there is no data set".into()))?;
+    let folder = folder.ok_or_else(|| EvalError::new("there is no data set"))?;
     let people = People::open(folder, &eval.data, &eval.views)?;
     let (all, compared) = (people.views(), config.bench.views.min(people.views()));
     eval.views.compared = (0..compared).map(|i| (2 * i + 1) * all / (2 * compared)).collect();
     let nobody = || match eval.data.only.as_slice() {
-        [] => EvalError::Message(format!("{}: has no people", folder.display())),
-        only => EvalError::Message(format!("{}: has no person named {}", folder.display(), only.join(", "))),
+        [] => EvalError::new(format!("{}: has no people", folder.display())),
+        only => EvalError::new(format!("{}: has no person named {}", folder.display(), only.join(", "))),
     };
     let first = people.chosen.first().copied().ok_or_else(nobody)?;
 
@@ -159,7 +162,7 @@ pub fn measure(
     let (_, render) = timed(runs.min(FEW), || rendered(&made.gaussians, &camera, side, &eval.views))?;
     modules.push((format!("rendering a view of {side}²"), render));
     let patch = patch(&made.gaussians, &camera.resized(side as u32, side as u32), config.bench.oracle);
-    let (splat_error, cutoff_error) = oracle::errors(&made.gaussians, &patch, &eval.views.render_options())?;
+    let (splat_error, cutoff_error) = splat_errors(&made.gaussians, &patch, &eval.views.render_options())?;
 
     let gaussians = made.gaussians.len();
     let plan = made.steps.iter().map(ToString::to_string).collect();
@@ -167,7 +170,7 @@ pub fn measure(
     let outcome = evaluate(&eval, std::slice::from_ref(&people), &[contestant], lpips, &|_, _| ());
     let judged = &outcome.judged[0];
     let scores: Vec<Score> = judged.rows.iter().map(|row| row.scores[0]).collect();
-    let score = Score::mean(&scores).ok_or_else(|| EvalError::Message("no view could be compared".into()))?;
+    let score = Score::mean(&scores).ok_or_else(|| EvalError::new("no view could be compared"))?;
     let points = |sides: bool| {
         let errors = judged.points.iter().filter(|error| (error.view > 1) == sides);
         mean(&errors.map(|error| 1e3 * error.mean).collect::<Vec<_>>())
@@ -189,7 +192,7 @@ pub fn measure(
         render,
         gaussians,
         score,
-        people: by_person(&judged.rows, 0).into_iter().map(of_person).collect(),
+        people: by_person(judged.rows.iter(), 0).into_iter().map(of_person).collect(),
         lpips_weights: lpips_weights.into(),
         points_mm: points(false),
         sides_mm: points(true),
@@ -200,7 +203,7 @@ pub fn measure(
 }
 
 /// The result of the last of `count` calls, and the median of their seconds.
-fn timed<T>(count: usize, mut call: impl FnMut() -> Result<T, EvalError>) -> Result<(T, f64), EvalError> {
+fn timed<T>(count: usize, mut call: impl FnMut() -> Result<T>) -> Result<(T, f64)> {
     let (mut times, mut last) = (Vec::new(), None);
     for _ in 0..count {
         let start = Instant::now();
@@ -213,12 +216,33 @@ fn timed<T>(count: usize, mut call: impl FnMut() -> Result<T, EvalError>) -> Res
 /// A camera for the patch of a picture around the middle of the Gaussians.
 fn patch(shown: &Gaussians, camera: &Camera, side: u32) -> Camera {
     let side = side.min(camera.width).min(camera.height);
-    let mean = snapsnap_ops::host(shown.means.clone().mean_dim(0));
+    let mean = host(shown.means.clone().mean_dim(0));
     let middle = DVec3::new(mean[0].into(), mean[1].into(), mean[2].into());
     let middle = camera.project(middle).map_or(camera.principal_point, |(at, _)| at);
     let most = DVec2::new(f64::from(camera.width - side), f64::from(camera.height - side));
     let corner = (middle - 0.5 * f64::from(side)).round().clamp(DVec2::ZERO, most);
     Camera { width: side, height: side, principal_point: camera.principal_point - corner, ..*camera }
+}
+
+/// Largest differences of a colour in a view: between renderer and oracle with the same cut-offs, and between oracles
+/// with and without cut-offs. Without cut-offs pixels never close, and splats fade smoothly and may be opaque.
+fn splat_errors(gaussians: &Gaussians, camera: &Camera, options: &RenderOptions) -> Result<(f64, f64)> {
+    let got = host(render(gaussians, std::slice::from_ref(camera), options)?.color);
+    let Gaussians { means, rotations, scales, opacities, colors } = gaussians.clone();
+    let rows = host(Tensor::cat(vec![means, rotations, scales, opacities.unsqueeze_dim(1), colors], 1));
+    let rows = rows.as_chunks().0.iter().map(|row| row.map(f64::from));
+    let scene = Scene { gaussians: rows.collect(), background: [0.0; 3] };
+    let hard = reference::render(&scene, camera, options, Cutoff::Hard);
+    let whole = RenderOptions { max_alpha: WHOLE, ..options.clone() };
+    let smooth = reference::render(&scene, camera, &whole, Cutoff::Smooth);
+    let (mut rounding, mut cutoffs) = (0.0_f64, 0.0_f64);
+    for ((hard, smooth), got) in hard.iter().zip(&smooth).zip(got.chunks_exact(3)) {
+        for ((hard, smooth), got) in hard.iter().zip(smooth).zip(got) {
+            rounding = rounding.max((f64::from(*got) - hard).abs());
+            cutoffs = cutoffs.max((hard - smooth).abs());
+        }
+    }
+    Ok((rounding, cutoffs))
 }
 
 /// Relative difference of times. Smaller differences are noise.

@@ -14,11 +14,11 @@ use super::model::{Model, no_gaussian};
 use super::person::{People, Points, nearest_view, photograph, points};
 use super::sides::side_points;
 use super::surface::Truth;
-use crate::EvalError;
 use crate::foreign::Palette;
 use crate::geometry::{ALIGNED, Align, double, icp, opaque_centres, thinned};
 use crate::parts::{PartError, part_errors};
 use crate::points::{Pair, PointError, point_errors};
+use crate::{EvalError, Result};
 
 /// Azimuths of the right and the left side, degrees from the first photograph.
 const SIDES: [f64; 2] = [90.0, 270.0];
@@ -99,7 +99,7 @@ impl Contestant {
         inputs: &[usize],
         canvas: usize,
         (metrics, truth): (&MetricsSection, Option<&Truth>),
-    ) -> Result<Shown, EvalError> {
+    ) -> Result<Shown> {
         let plain = |gaussians: Gaussians| match gaussians.is_empty() {
             true => Err(no_gaussian()),
             false => Ok(Shown {
@@ -120,13 +120,9 @@ impl Contestant {
                 let unchanged = item;
                 let item = own.as_ref().unwrap_or(item);
                 let mut made = model.reconstruct(item, inputs)?;
-                let aligned = match metrics.align {
-                    Align::None => None,
-                    _ => {
-                        let (gaussians, maps) = (&mut made.gaussians, &mut made.maps);
-                        Some(aligned(gaussians, maps, metrics, truth, &item.cameras[inputs[0]])?)
-                    }
-                };
+                let front = &item.cameras[inputs[0]];
+                let align = || aligned(&mut made.gaussians, &mut made.maps, metrics, truth, front);
+                let aligned = (metrics.align != Align::None).then(align).transpose()?;
                 // Pictures can be compared without errors of points.
                 let points = errors(people, row, unchanged, inputs, &made.maps, model.side());
                 let points = points.map_err(|e| e.to_string());
@@ -153,7 +149,7 @@ impl Contestant {
                 }
                 let Some((points, there)) = points(&people.test, row, &views, item.side, canvas)? else {
                     let message = format!("views of {}² give no points on a canvas of {canvas}²", item.side);
-                    return Err(EvalError::Message(message));
+                    return Err(EvalError::new(message));
                 };
                 let (photographs, mut valid) = on_canvas(item, inputs.len(), canvas);
                 valid.resize(views.len(), vec![true; canvas * canvas]);
@@ -175,8 +171,8 @@ fn aligned(
     metrics: &MetricsSection,
     truth: Option<&Truth>,
     front: &Camera,
-) -> Result<[f64; 3], EvalError> {
-    let truth = truth.ok_or_else(|| EvalError::Message("there is no ground truth to align with".into()))?;
+) -> Result<[f64; 3]> {
+    let truth = truth.ok_or_else(|| EvalError::new("there is no ground truth to align with"))?;
     let centres = opaque_centres(gaussians, ALIGNED)?;
     let motion = icp(&centres, &thinned(&truth.points, 10 * ALIGNED), metrics.align == Align::Similarity)?;
     *gaussians = gaussians.clone().scaled(motion.scale).transformed(&motion.rigid());
@@ -213,7 +209,7 @@ fn errors(
     inputs: &[usize],
     maps: &[(usize, Vec<f32>)],
     side: usize,
-) -> Result<PointErrors, EvalError> {
+) -> Result<PointErrors> {
     // Pairs of more than two photographs have no common frame.
     if maps.is_empty() {
         return Ok(PointErrors::default());

@@ -14,8 +14,8 @@ use super::config::EvalConfig;
 use super::person::People;
 use super::shared::{LeftOut, everybody, missing, name_of};
 use super::surface::truth as truth_of;
-use crate::EvalError;
 use crate::geometry::{ALIGNED, Align, chamfer, icp, point_to_surface, sampled, thinned};
+use crate::{EvalError, Result};
 
 /// Points drawn from each surface.
 const POINTS: usize = 50_000;
@@ -75,10 +75,10 @@ fn one(
     row: usize,
     names: &[&str],
     folder: &Path,
-) -> Result<MeshFigures, EvalError> {
+) -> Result<MeshFigures> {
     let mut mesh = import::read(&find(folder, names)?)?;
     let seen = truth_of(people, row)?;
-    let scan = |scans: &PathBuf| -> Result<Mesh, EvalError> {
+    let scan = |scans: &PathBuf| -> Result<Mesh> {
         let path = find(scans, names)?;
         let mut scan = import::read(&path)?;
         // The scan gets the pose that `prepare` gave it. Test people are not moved sideways.
@@ -116,7 +116,7 @@ fn one(
 }
 
 /// The mesh of a person in a folder: the first file that exists under one of the names.
-fn find(folder: &Path, names: &[&str]) -> Result<PathBuf, EvalError> {
+fn find(folder: &Path, names: &[&str]) -> Result<PathBuf> {
     let files = names.iter().flat_map(|name| {
         // Collections of scans have a folder for each scan.
         let in_folder = format!("{name}/{}", name.rsplit('/').next().unwrap_or(name));

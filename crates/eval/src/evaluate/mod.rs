@@ -17,7 +17,7 @@ use image::RgbImage;
 use rayon::prelude::*;
 use snapsnap_data::sample::{PhotographChanges, TestItem};
 
-use crate::EvalError;
+use crate::Result;
 use crate::foreign::Traces;
 use crate::geometry::Align;
 use crate::lpips::Lpips;
@@ -79,10 +79,7 @@ pub struct Judged {
 }
 
 /// Mean score of each person's views, by index in [`Outcome::people`].
-pub(crate) fn by_person<'a>(
-    rows: impl IntoIterator<Item = &'a Row>,
-    protocol: usize,
-) -> BTreeMap<usize, Score> {
+pub(crate) fn by_person<'a>(rows: impl Iterator<Item = &'a Row>, protocol: usize) -> BTreeMap<usize, Score> {
     let mut scores: BTreeMap<usize, Vec<Score>> = BTreeMap::new();
     for row in rows {
         scores.entry(row.person).or_default().push(row.scores[protocol]);
@@ -150,7 +147,7 @@ struct Place<'a> {
 }
 
 /// A contestant's index, and its scores by protocol with the traces of the background.
-type Scored = (usize, Result<(Vec<Score>, Option<Traces>), EvalError>);
+type Scored = (usize, Result<(Vec<Score>, Option<Traces>)>);
 
 impl Place<'_> {
     /// Records a failure; `what` follows the person's name.
@@ -197,7 +194,7 @@ impl Place<'_> {
             [view] => vec![compare(view)],
             views => views.par_iter().map(compare).collect(),
         });
-        let found: Vec<Result<Vec<Scored>, EvalError>> = found.collect();
+        let found: Vec<Result<Vec<Scored>>> = found.collect();
         for (view, found) in compared.into_iter().zip(found) {
             let degrees = person::degrees(&item.cameras[view], &item.cameras[inputs[0]]);
             let scored = self.kept(outcome, &format!(", view {view}"), found);
@@ -242,12 +239,7 @@ impl Place<'_> {
     }
 
     /// Compares the pictures of a view.
-    fn compare(
-        &self,
-        item: &TestItem,
-        view: usize,
-        shown: &[Option<Shown>],
-    ) -> Result<Vec<Scored>, EvalError> {
+    fn compare(&self, item: &TestItem, view: usize, shown: &[Option<Shown>]) -> Result<Vec<Scored>> {
         let Self { config, people, .. } = *self;
         let side = people.side(&config.views);
         let (target, mask) = people.target(self.row, view, side)?;
@@ -303,17 +295,12 @@ pub fn sheet(
 }
 
 /// A row of the sheet.
-fn pictures(
-    config: &EvalConfig,
-    people: &People,
-    row: usize,
-    contestant: &Contestant,
-) -> Result<Vec<RgbImage>, EvalError> {
+fn pictures(config: &EvalConfig, people: &People, row: usize, model: &Contestant) -> Result<Vec<RgbImage>> {
     let inputs = people.inputs(&config.views);
     let item = people.item(row, &inputs, &PhotographChanges::default())?;
     let side = people.side(&config.views);
     let truth = (config.metrics.align != Align::None).then(|| truth(people, row)).transpose()?;
-    let shown = contestant.prepare(people, row, &item, &inputs, side, (&config.metrics, truth.as_ref()))?;
+    let shown = model.prepare(people, row, &item, &inputs, side, (&config.metrics, truth.as_ref()))?;
     let mut pictures = Vec::new();
     for view in &inputs[..2] {
         let (target, _) = people.target(row, *view, side)?;
@@ -321,7 +308,7 @@ fn pictures(
     }
     for wanted in &config.report.degrees {
         let view = person::nearest_view(&item.cameras, inputs[0], *wanted);
-        let views = contestant.views(&config.views);
+        let views = model.views(&config.views);
         let image = rendered(&shown.gaussians, &item.cameras[view], side, &views)?;
         let (target, _) = people.target(row, view, side)?;
         let window = Region::paper(&target)?.window;

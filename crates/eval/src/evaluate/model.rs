@@ -16,11 +16,11 @@ use snapsnap_photo::{Cutting, Frame, Person, Photographs, Restoration, Source as
 use snapsnap_splat::Gaussians;
 
 use super::person::{degrees, photograph};
-use crate::EvalError;
 use crate::foreign::overlap;
 use crate::geometry::procrustes;
 use crate::statistics::mean;
 use crate::variant::Variant;
+use crate::{EvalError, Result};
 
 /// The networks of a variant on a device.
 pub struct Model {
@@ -80,12 +80,12 @@ impl Model {
     }
 
     /// Refuses cameras `found` degrees apart if the networks are for neighbours at another angle.
-    fn check_pair(&self, found: f64) -> Result<(), EvalError> {
+    fn check_pair(&self, found: f64) -> Result<()> {
         /// Largest deviation of a known camera, degrees.
         const MOST: f64 = 0.5;
         let expected = self.reconstructor.config().network.pair_degrees;
         if expected != OPPOSITE && (found - expected).abs() > MOST {
-            return Err(EvalError::Message(format!(
+            return Err(EvalError::new(format!(
                 "`views.inputs` are {found:.1}° apart, but `network.pair_degrees` of the weights is {expected}"
             )));
         }
@@ -93,7 +93,7 @@ impl Model {
     }
 
     /// The photographs, placed on their canvases. [`Cutting::Given`] uses the data set's masks.
-    fn canvases(&self, item: &TestItem, cutting: Cutting) -> Result<Photographs, EvalError> {
+    fn canvases(&self, item: &TestItem, cutting: Cutting) -> Result<Photographs> {
         let (config, name) = (self.reconstructor.config(), Path::new(&item.subject));
         let knows_masks = cutting == Cutting::Given;
         let sources = item
@@ -109,7 +109,7 @@ impl Model {
     ///
     /// # Errors
     /// [`EvalError`] without a person or a Gaussian, and for more than two photographs on the road `user`.
-    pub fn reconstruct(&self, item: &TestItem, inputs: &[usize]) -> Result<Made, EvalError> {
+    pub fn reconstruct(&self, item: &TestItem, inputs: &[usize]) -> Result<Made> {
         match self.photographs.road {
             Road::Canvas => {
                 let canvases: Vec<_> =
@@ -125,16 +125,16 @@ impl Model {
     }
 
     /// The person of photographs with unknown masks and cameras, in the data set's world.
-    fn of_user(&self, item: &TestItem, inputs: &[usize]) -> Result<Made, EvalError> {
+    fn of_user(&self, item: &TestItem, inputs: &[usize]) -> Result<Made> {
         let &[front, back] = inputs else {
             let message = "`photographs.road = \"user\"` is for a front and a back: `views.inputs`";
-            return Err(EvalError::Message(message.into()));
+            return Err(EvalError::new(message));
         };
         let config = self.reconstructor.config();
         if config.world_frame() == WorldFrame::Mirrored || config.rotation_frame() == RotationFrame::World {
             let message =
                 "`photographs.road = \"user\"` is for networks whose people are upright: `mode.compat`";
-            return Err(EvalError::Message(message.into()));
+            return Err(EvalError::new(message));
         }
         self.check_pair(degrees(&item.cameras[back], &item.cameras[front]))?;
         let photographs = self.canvases(item, Cutting::All)?;
@@ -142,7 +142,7 @@ impl Model {
         let overlaps: Vec<f64> = pairs.map(|((_, found), (_, truth))| overlap(found, truth)).collect();
         let start = Instant::now();
         let person = snapsnap_photo::person(&photographs, &self.reconstructor, &Told::default(), &|_| ());
-        let Person { gaussians, made, .. } = person.map_err(|none| EvalError::Message(none.to_string()))?;
+        let Person { gaussians, made, .. } = person.map_err(EvalError::new)?;
         let time = start.elapsed();
         let cameras = [&item.cameras[front], &item.cameras[back]];
         let mappings = [0, 1].map(|i| &photographs.frames[i].mapping);
@@ -171,7 +171,7 @@ impl Model {
         inputs: &[usize],
         photographs: &[Photograph],
         frames: Option<&[Frame]>,
-    ) -> Result<Made, EvalError> {
+    ) -> Result<Made> {
         let side = self.side();
         let start = Instant::now();
         let count = if inputs.len() == 2 { 1 } else { inputs.len() };
@@ -236,18 +236,13 @@ impl Model {
     }
 
     /// The Gaussians that stride, least opacity and `only_front` (the first photograph's) keep, and their origins.
-    fn thinned(
-        &self,
-        gaussians: Gaussians,
-        origins: &[Origin],
-        only_front: bool,
-    ) -> (Gaussians, Vec<Origin>) {
+    fn thinned(&self, person: Gaussians, origins: &[Origin], only_front: bool) -> (Gaussians, Vec<Origin>) {
         let Variant { stride, min_opacity, .. } = self.variant;
         let (stride, min_opacity) = (stride.unwrap_or(1), min_opacity.unwrap_or(0.0));
         if stride == 1 && min_opacity <= 0.0 && !only_front {
-            return (gaussians, origins.to_vec());
+            return (person, origins.to_vec());
         }
-        let (side, opacities) = (self.side(), host(gaussians.opacities.clone()));
+        let (side, opacities) = (self.side(), host(person.opacities.clone()));
         let is_kept = |row: &usize| {
             let Origin { view, pixel } = origins[*row];
             let on_grid =
@@ -256,11 +251,11 @@ impl Model {
         };
         let keep: Vec<i32> = (0..origins.len()).filter(is_kept).map(|row| row as i32).collect();
         let kept = keep.iter().map(|row| origins[*row as usize]).collect();
-        let gaussians = rows(&gaussians, &keep);
+        let gaussians = rows(&person, &keep);
         (Gaussians { scales: gaussians.scales * stride as f64, ..gaussians }, kept)
     }
 }
 
 pub(super) fn no_gaussian() -> EvalError {
-    EvalError::Message("no Gaussian came out".into())
+    EvalError::new("no Gaussian came out")
 }

@@ -16,9 +16,9 @@ use snapsnap_photo::on_canvas;
 use snapsnap_splat::Camera;
 
 use super::config::{DataSection, ViewsSection};
-use crate::EvalError;
 use crate::geometry::double;
 use crate::pictures::Picture;
+use crate::{EvalError, Result};
 
 /// The people of one data set.
 pub struct People {
@@ -35,7 +35,7 @@ impl People {
     ///
     /// # Errors
     /// [`EvalError`] if the folder is no data set, or does not have the views of the config.
-    pub fn open(path: &Path, data: &DataSection, views: &ViewsSection) -> Result<Self, EvalError> {
+    pub fn open(path: &Path, data: &DataSection, views: &ViewsSection) -> Result<Self> {
         let folder = Arc::new(Folder::open(path)?);
         let wrong = |message: &str| EvalError::File(FileError::unsuitable(path, message));
         if let Some(split) = data.split.filter(|split| !folder.splits().contains(&Some(*split))) {
@@ -87,12 +87,7 @@ impl People {
     ///
     /// # Errors
     /// [`EvalError::File`], also for a camera that mirrors: no quaternion can express the mirrored Gaussians.
-    pub fn item(
-        &self,
-        row: usize,
-        inputs: &[usize],
-        changes: &PhotographChanges,
-    ) -> Result<TestItem, EvalError> {
+    pub fn item(&self, row: usize, inputs: &[usize], changes: &PhotographChanges) -> Result<TestItem> {
         let item = self.test.sample(row, inputs, changes)?;
         let mirrors = |camera: &Camera| camera.world_to_camera.rotation.determinant() < 0.0;
         if let Some(view) = item.cameras.iter().position(mirrors) {
@@ -107,7 +102,7 @@ impl People {
     ///
     /// # Errors
     /// [`EvalError::File`].
-    pub fn target(&self, row: usize, view: usize, side: usize) -> Result<(Picture, Vec<f32>), EvalError> {
+    pub fn target(&self, row: usize, view: usize, side: usize) -> Result<(Picture, Vec<f32>)> {
         let (values, mask) = self.test.target(row, view, [0.0; 3])?;
         let stored = self.folder.description().resolution as usize;
         let values = smaller(values, 3, stored, side);
@@ -158,27 +153,21 @@ pub type Points = (Vec<f32>, Vec<f32>);
 
 /// Ground-truth points of some views on a canvas of `side` pixels: `[V,S,S,3]` metres in the first view's frame, and
 /// their mask `[V,S,S]`. A pixel of the canvas has the mean of its stored points, if at least half of its area has
-/// points. `None` if `side` does not divide the stored side.
+/// points. `None` if `side` does not divide the stored side `from`.
 ///
 /// # Errors
 /// [`EvalError`] for a file of a view that cannot be read.
-pub fn points(
-    test: &Test,
-    row: usize,
-    views: &[usize],
-    stored: usize,
-    side: usize,
-) -> Result<Option<Points>, EvalError> {
-    if !stored.is_multiple_of(side) {
+pub fn points(test: &Test, row: usize, views: &[usize], from: usize, side: usize) -> Result<Option<Points>> {
+    if !from.is_multiple_of(side) {
         return Ok(None);
     }
     let (points, valid) = test.points(row, views)?;
-    if stored == side {
+    if from == side {
         return Ok(Some((points, valid)));
     }
-    let area = stored * stored;
+    let area = from * from;
     let views = points.chunks_exact(3 * area).zip(valid.chunks_exact(area));
-    let (points, valid): (Vec<_>, Vec<_>) = views.map(|(p, v)| means(p, v, stored, side)).unzip();
+    let (points, valid): (Vec<_>, Vec<_>) = views.map(|(p, v)| means(p, v, from, side)).unzip();
     Ok(Some((points.concat(), valid.concat())))
 }
 

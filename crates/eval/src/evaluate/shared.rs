@@ -6,7 +6,7 @@ use snapsnap_splat::{Camera, Gaussians, render};
 
 use super::config::{EvalConfig, ViewsSection};
 use super::person::People;
-use crate::EvalError;
+use crate::Result;
 use crate::pictures::Picture;
 
 /// A part of an evaluation that failed.
@@ -72,15 +72,10 @@ pub(super) fn at_once(side: usize) -> usize {
 /// A render of Gaussians (world frame) over black, `side`² pixels, with the config's options.
 ///
 /// # Errors
-/// [`EvalError`] for Gaussians that cannot be rendered.
-pub fn rendered(
-    gaussians: &Gaussians,
-    camera: &Camera,
-    side: usize,
-    views: &ViewsSection,
-) -> Result<Picture, EvalError> {
+/// [`EvalError`](crate::EvalError) for Gaussians that cannot be rendered.
+pub fn rendered(shown: &Gaussians, camera: &Camera, side: usize, views: &ViewsSection) -> Result<Picture> {
     let large = side * views.supersampling;
     let camera = camera.resized(large as u32, large as u32);
-    let color = render(gaussians, std::slice::from_ref(&camera), &views.render_options())?.color;
+    let color = render(shown, std::slice::from_ref(&camera), &views.render_options())?.color;
     Picture::rendered(&snapsnap_ops::host(color), [large, large], views.supersampling)
 }

@@ -5,7 +5,7 @@ use snapsnap_data::sample::{Test, TestItem};
 use snapsnap_splat::Camera;
 
 use super::person::{Points, off};
-use crate::EvalError;
+use crate::Result;
 use crate::geometry::double;
 
 /// Number of views whose points are joined to a side.
@@ -24,7 +24,7 @@ const REACH: f64 = 0.5;
 /// the view at this angle, or else from the nearest views. The mask is empty if no view is near.
 ///
 /// # Errors
-/// [`EvalError::File`].
+/// [`EvalError::File`](crate::EvalError::File).
 pub fn side_points(
     test: &Test,
     row: usize,
@@ -32,7 +32,7 @@ pub fn side_points(
     first: usize,
     azimuth: f64,
     side: usize,
-) -> Result<Points, EvalError> {
+) -> Result<Points> {
     let front = &item.cameras[first];
     let away = |view: &usize| off(&item.cameras[*view], front, azimuth);
     let mut near: Vec<usize> = (0..item.cameras.len()).filter(|view| away(view) <= FARTHEST + SAME).collect();

@@ -11,8 +11,8 @@ use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use super::person::{People, means, nearest_view, part_of};
 use super::shared::at_once;
-use crate::EvalError;
 use crate::geometry::{Chamfer, chamfer, consistency, double, normals, opaque_centres, sampled, thinned};
+use crate::{EvalError, Result};
 
 /// Largest number of ground-truth points per view.
 const PER_VIEW: usize = 4000;
@@ -65,7 +65,7 @@ pub struct Truth {
 ///
 /// # Errors
 /// [`EvalError`] for files that cannot be read, or if no view has a point.
-pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
+pub fn truth(people: &People, row: usize) -> Result<Truth> {
     let cameras = people.test.sample(row, &[], &PhotographChanges::default())?.cameras;
     let directions = DIRECTIONS.map(|wanted| nearest_view(&cameras, 0, wanted));
     let of_view = |(view, camera): (usize, &Camera)| {
@@ -89,13 +89,13 @@ pub fn truth(people: &People, row: usize) -> Result<Truth, EvalError> {
     let numbered: Vec<(usize, &Camera)> = cameras.iter().enumerate().collect();
     let mut found = Vec::new();
     for views in numbered.chunks(at_once(people.folder.description().resolution as usize)) {
-        let part: Result<Vec<_>, EvalError> = views.par_iter().map(|view| of_view(*view)).collect();
+        let part: Result<Vec<_>> = views.par_iter().map(|view| of_view(*view)).collect();
         found.extend(part?);
     }
     let (points, views): (Vec<_>, Vec<_>) = found.into_iter().unzip();
     let truth = Truth { points: points.concat(), views: views.into_iter().flatten().collect() };
     if truth.points.is_empty() {
-        return Err(EvalError::Message("no view has a depth: there is no ground truth".into()));
+        return Err(EvalError::new("no view has a depth: there is no ground truth"));
     }
     Ok(truth)
 }
@@ -118,8 +118,8 @@ impl Truth {
     ///
     /// # Errors
     /// [`EvalError::Message`] for a mesh that cannot be drawn.
-    pub fn agreement_of_mesh(&self, mesh: &Mesh) -> Result<Option<f64>, EvalError> {
-        let renderer = Renderer::new(mesh).map_err(|e| EvalError::Message(e.to_string()))?;
+    pub fn agreement_of_mesh(&self, mesh: &Mesh) -> Result<Option<f64>> {
+        let renderer = Renderer::new(mesh).map_err(EvalError::new)?;
         let options = ViewOptions { samples: 1, ..ViewOptions::default() };
         Ok(self.agreement(|i| renderer.draw(&self.views[i].camera, &options).depth))
     }
@@ -152,14 +152,14 @@ impl Surface {
     ///
     /// # Errors
     /// [`EvalError`] if no Gaussian is so opaque.
-    pub fn of_gaussians(gaussians: &Gaussians, truth: &Truth) -> Result<Self, EvalError> {
+    pub fn of_gaussians(gaussians: &Gaussians, truth: &Truth) -> Result<Self> {
         let centres = opaque_centres(gaussians, MOST)?;
         let options = RenderOptions { depth: true, ..RenderOptions::inria() };
         let drawn = |view: &TrueView| {
             let rendered = render(gaussians, std::slice::from_ref(&view.camera), &options)?;
             Ok([rendered.depth.expect("an option"), rendered.alpha].map(snapsnap_ops::host))
         };
-        let drawn: Vec<[Vec<f32>; 2]> = truth.views.iter().map(drawn).collect::<Result<_, EvalError>>()?;
+        let drawn: Vec<[Vec<f32>; 2]> = truth.views.iter().map(drawn).collect::<Result<_>>()?;
         // Depths are weighted by coverage. A pixel of a surface has a coverage above ½.
         let surface = |[depth, alpha]: &[Vec<f32>; 2]| {
             depth.iter().zip(alpha).map(|(z, a)| if *a > 0.5 { z / a } else { 0.0 }).collect()
@@ -175,9 +175,9 @@ impl Surface {
     ///
     /// # Errors
     /// [`EvalError`] if no mesh can be made of the Gaussians.
-    pub fn of_mesh(gaussians: &Gaussians, truth: &Truth) -> Result<Self, EvalError> {
+    pub fn of_mesh(gaussians: &Gaussians, truth: &Truth) -> Result<Self> {
         let fused = fuse(&gaussians.clone().into(), Options::default(), &|_| {});
-        let mesh = fused.map_err(|e| EvalError::Message(e.to_string()))?.mesh;
+        let mesh = fused.map_err(EvalError::new)?.mesh;
         let drawn = sampled(&mesh, MOST, SEED)?;
         Ok(Self {
             chamfer: chamfer(&drawn, &truth.points)?,

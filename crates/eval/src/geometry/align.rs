@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use snapsnap_splat::RigidTransform;
 
 use super::{check_points, double, nearest};
-use crate::EvalError;
+use crate::Result;
 
 /// Number of points that are aligned. The truth has ten times as many.
 pub(crate) const ALIGNED: usize = 5_000;
@@ -77,8 +77,8 @@ impl Alignment {
 /// must be below some 30° and a quarter of the size.
 ///
 /// # Errors
-/// [`EvalError::Message`] for a set without points or with one that is not finite.
-pub fn icp(points: &[[f32; 3]], onto: &[[f32; 3]], scale: bool) -> Result<Alignment, EvalError> {
+/// [`EvalError::Message`](crate::EvalError::Message) for a set without points or with one that is not finite.
+pub fn icp(points: &[[f32; 3]], onto: &[[f32; 3]], scale: bool) -> Result<Alignment> {
     check_points(points)?;
     check_points(onto)?;
     let cost = |moved: &[[f32; 3]]| {

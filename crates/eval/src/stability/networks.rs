@@ -65,11 +65,8 @@ pub fn sixteen_bits(weights: WeightFile, photographs: [Photograph; 2]) -> Vec<Ca
     [Precision::F16, Precision::Bf16].map(case).into()
 }
 
-fn in_precision(
-    (weights, [front, back]): &(WeightFile, [Photograph; 2]),
-    precision: Precision,
-    device: &Device,
-) -> Found {
+fn in_precision(given: &(WeightFile, [Photograph; 2]), precision: Precision, device: &Device) -> Found {
+    let (weights, [front, back]) = given;
     if !device.supports_dtype(precision.dtype()) {
         return Found::skipped(format!("the device does not compute in {}", precision.name()));
     }
@@ -216,7 +213,7 @@ fn attended(tokens: &[f32], values: &[f32], device: &Device) -> Found {
     let shape = [1, TOKENS, CHANNELS];
     let [q, k, v] = [tokens, tokens, values].map(|rows| tracked(rows.to_vec(), shape, device));
     let rope = Rope::new(3, 4, CHANNELS / HEADS, 100.0, &device.clone().autodiff());
-    let out = rotary_attention(q.clone(), k.clone(), v.clone(), &rope, HEADS, false);
+    let out = rotary_attention([&q, &k, &v].map(Tensor::clone), &rope, HEADS, false);
     let gradients = out.clone().sum().backward();
     let gradient: Vec<f32> =
         [&q, &k, &v].iter().flat_map(|t| host(t.grad(&gradients).expect("tracked"))).collect();

@@ -53,6 +53,6 @@ impl CrossAttention {
     /// Queries `x` `[B, N, dim]`, memory `y` `[B, M, dim]` → `[B, N, dim]`.
     pub(crate) fn forward(&self, x: Tensor<3>, y: Tensor<3>, rope: &Rope) -> Tensor<3> {
         let (q, k, v) = (linear(&self.projq, x), linear(&self.projk, y.clone()), linear(&self.projv, y));
-        linear(&self.proj, rotary_attention(q, k, v, rope, self.heads, is_bf16(&self.proj.weight)))
+        linear(&self.proj, rotary_attention([q, k, v], rope, self.heads, is_bf16(&self.proj.weight)))
     }
 }

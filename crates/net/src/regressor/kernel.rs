@@ -21,10 +21,6 @@ struct Pass {
 }
 
 impl Kernel for Pass {
-    fn shape(&self) -> Vec<usize> {
-        self.size.into_iter().chain([FEATURES]).collect()
-    }
-
     fn forward(&self, [input, parameters, _]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let (features, saved) = self.network.forward(parameters, input, self.size, keep);
         (features, saved.map(|saved| Box::new(saved) as _))
@@ -45,7 +41,8 @@ pub fn regress(unet: &UNet, last: &Conv2d, input: Tensor<4>) -> Tensor<4> {
     let network = Network::default();
     let parameters = flat(&network, unet, last);
     let none: Option<Tensor<1>> = None;
-    op::run(Pass { network, size: [b, h, w] }, input.permute([0, 2, 3, 1]), Some(parameters), none)
+    let pass = Pass { network, size: [b, h, w] };
+    op::run(pass, [b, h, w, FEATURES], input.permute([0, 2, 3, 1]), Some(parameters), none)
 }
 
 /// All parameters in the order of the network's layout.

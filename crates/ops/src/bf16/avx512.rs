@@ -1,15 +1,15 @@
 //! Packing and the kernel for AVX-512 with instructions for bf16.
 
-#![allow(unsafe_code, reason = "functions for processors that have these instructions, and loads of vectors")]
+#![allow(unsafe_code, reason = "functions for processors that have these instructions")]
 
 use std::arch::x86_64::{
     __m512, __m512bh, __m512i, _mm512_cvtepu16_epi32, _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh,
-    _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_or_si512, _mm512_set1_epi32,
-    _mm512_setzero_ps, _mm512_setzero_si512, _mm512_shuffle_i32x4, _mm512_slli_epi32, _mm512_storeu_ps,
-    _mm512_storeu_si512, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64, _mm512_unpacklo_epi32,
-    _mm512_unpacklo_epi64,
+    _mm512_dpbf16_ps, _mm512_or_si512, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_setzero_si512,
+    _mm512_shuffle_i32x4, _mm512_slli_epi32, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64,
+    _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
 };
-use std::mem::transmute;
+
+use pulp::cast;
 
 use super::{BLOCK, Columns, PAIRS, PANEL, Row, Source, Sums};
 
@@ -68,12 +68,12 @@ fn kernel<const ROWS: usize, const VECTORS: usize>(
     for (block, panel) in panel.as_chunks::<PAIRS>().0.iter().enumerate() {
         let rows: &[Row; ROWS] = left[block * packed..].first_chunk().expect("the block lies inside");
         for (pair, columns) in panel.iter().enumerate() {
-            let mut right = [as_halves(_mm512_setzero_si512()); VECTORS];
-            for (v, right) in right.iter_mut().enumerate() {
-                *right = as_halves(words(&columns.as_chunks().0[v]));
+            let mut right: [__m512bh; VECTORS] = [cast(_mm512_setzero_si512()); VECTORS];
+            for (right, columns) in right.iter_mut().zip(columns.as_chunks::<PAIRS>().0) {
+                *right = cast(*columns);
             }
             for (sums, row) in sums.iter_mut().zip(rows) {
-                let value = as_halves(_mm512_set1_epi32(row[pair].cast_signed()));
+                let value = cast(_mm512_set1_epi32(row[pair].cast_signed()));
                 for (sum, right) in sums.iter_mut().zip(right) {
                     *sum = _mm512_dpbf16_ps(*sum, value, right);
                 }
@@ -81,8 +81,8 @@ fn kernel<const ROWS: usize, const VECTORS: usize>(
         }
     }
     for (out, sums) in out.iter_mut().zip(sums) {
-        for (out, sum) in out.as_chunks_mut().0.iter_mut().zip(sums) {
-            put(sum, out);
+        for (out, sum) in out.as_chunks_mut::<PAIRS>().0.iter_mut().zip(sums) {
+            *out = cast(sum);
         }
     }
 }
@@ -92,7 +92,7 @@ fn left(source: &Source, out: &mut [Row]) {
     for (block, out) in out.chunks_exact_mut(source.packed_rows()).enumerate() {
         for (i, out) in out.as_chunks_mut::<PAIRS>().0.iter_mut().enumerate() {
             let square = square(source, i * PAIRS, block * BLOCK, true);
-            out.iter_mut().zip(square).for_each(|(out, row)| put_words(row, out));
+            out.iter_mut().zip(square).for_each(|(out, row)| *out = cast(row));
         }
     }
 }
@@ -105,7 +105,7 @@ fn right(source: &Source, out: &mut [Columns]) {
         for half in 0..PANEL / PAIRS {
             let square = square(source, panel * PANEL + half * PAIRS, block * BLOCK, false);
             for (out, row) in out.iter_mut().zip(square) {
-                put_words(row, &mut out.as_chunks_mut().0[half]);
+                out.as_chunks_mut::<PAIRS>().0[half] = cast(row);
             }
         }
     }
@@ -143,24 +143,21 @@ fn square(source: &Source, first: usize, k: usize, by_row: bool) -> [__m512i; PA
 fn line(values: &[f32], start: usize, step: usize, count: usize) -> __m512 {
     if step == 1 && count == PAIRS {
         let values: &[f32; PAIRS] = values[start..].first_chunk().expect("the line lies inside");
-        // SAFETY: sixteen floats are there.
-        return unsafe { _mm512_loadu_ps(values.as_ptr()) };
+        return cast(*values);
     }
     let mut line = [0.0; PAIRS];
     if count > 0 {
         let values = values[start..].iter().step_by(step);
         line[..count].iter_mut().zip(values).for_each(|(line, x)| *line = *x);
     }
-    // SAFETY: sixteen floats are there.
-    unsafe { _mm512_loadu_ps(line.as_ptr()) }
+    cast(line)
 }
 
 /// Words of the pairs (a₀, b₀), (a₁, b₁) …
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
 fn interleaved(a: __m512, b: __m512) -> __m512i {
-    // SAFETY: sixteen halves are sixteen integers.
-    let [a, b] = [a, b].map(|x| unsafe { transmute(_mm512_cvtneps_pbh(x)) });
+    let [a, b] = [cast(_mm512_cvtneps_pbh(a)), cast(_mm512_cvtneps_pbh(b))];
     let [a, b] = [_mm512_cvtepu16_epi32(a), _mm512_cvtepu16_epi32(b)];
     _mm512_or_si512(a, _mm512_slli_epi32::<16>(b))
 }
@@ -169,8 +166,7 @@ fn interleaved(a: __m512, b: __m512) -> __m512i {
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
 fn consecutive(a: __m512, b: __m512) -> __m512i {
-    // SAFETY: 32 halves are sixteen pairs.
-    unsafe { transmute(_mm512_cvtne2ps_pbh(b, a)) }
+    cast(_mm512_cvtne2ps_pbh(b, a))
 }
 
 /// Transposes in four rounds of shuffles: of words, of pairs of words, of quarters and of halves.
@@ -195,32 +191,4 @@ fn transpose(rows: &mut [__m512i; PAIRS]) {
             }
         }
     }
-}
-
-#[inline]
-#[target_feature(enable = "avx512f")]
-fn words(words: &Row) -> __m512i {
-    // SAFETY: sixteen words are there.
-    unsafe { _mm512_loadu_si512(words.as_ptr().cast()) }
-}
-
-#[inline]
-#[target_feature(enable = "avx512f")]
-fn put_words(words: __m512i, out: &mut Row) {
-    // SAFETY: there is room for sixteen words.
-    unsafe { _mm512_storeu_si512(out.as_mut_ptr().cast(), words) }
-}
-
-#[inline]
-#[target_feature(enable = "avx512f")]
-fn put(values: __m512, out: &mut [f32; PAIRS]) {
-    // SAFETY: there is room for sixteen floats.
-    unsafe { _mm512_storeu_ps(out.as_mut_ptr(), values) }
-}
-
-#[inline]
-#[target_feature(enable = "avx512f")]
-fn as_halves(words: __m512i) -> __m512bh {
-    // SAFETY: sixteen pairs are 32 halves.
-    unsafe { transmute(words) }
 }

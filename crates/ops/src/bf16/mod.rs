@@ -8,7 +8,7 @@
 //!
 //! Every element is one sum in one order, for any number of threads. Subnormal numbers count as 0.
 //!
-//! `unsafe` is needed to call functions with instructions that not every processor has, and to read and write vectors.
+//! `unsafe` is needed to call functions with instructions that not every processor has.
 
 #![cfg_attr(not(target_arch = "x86_64"), allow(unused, reason = "there is no unit"))]
 

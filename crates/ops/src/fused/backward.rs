@@ -191,14 +191,11 @@ impl<'a> Band<'a> {
     fn flush(&mut self) {
         let (products, count) = &mut self.products;
         let weights = &mut self.sums.weights;
-        vectorized(
-            #[inline(always)]
-            || {
-                for (all, part) in weights.iter_mut().zip(products.iter_mut()) {
-                    *all += f64::from(std::mem::take(part));
-                }
-            },
-        );
+        vectorized!(|| {
+            for (all, part) in weights.iter_mut().zip(products.iter_mut()) {
+                *all += f64::from(std::mem::take(part));
+            }
+        });
         *count = 0;
     }
 

@@ -104,10 +104,7 @@ impl Conv<'_> {
                 1 => arch.dispatch(Strided::<1>(row)),
                 _ => arch.dispatch(Strided::<2>(row)),
             }
-            let of_row = vectorized(
-                #[inline(always)]
-                || Moments::of_row(out),
-            );
+            let of_row = vectorized!(|| Moments::of_row(out));
             moments = moments.join(&of_row);
         }
         moments
@@ -125,19 +122,16 @@ fn fill(source: &Source, row: Option<usize>, enlarge: bool, out: &mut [f32]) {
     let (pixels, _) = plane.data[row / factor * line..][..line].as_chunks::<CHANNELS>();
     let end = out.len() - CHANNELS;
     let (out, _) = out[CHANNELS..end].as_chunks_mut::<CHANNELS>();
-    vectorized(
-        #[inline(always)]
-        move || {
-            for (x, pixel) in pixels.iter().enumerate() {
-                let mut value = *pixel;
-                if let Some([scale, shift]) = &affine {
-                    for c in 0..CHANNELS {
-                        value[c] = silu(value[c] * scale[c] + shift[c]);
-                    }
+    vectorized!(move || {
+        for (x, pixel) in pixels.iter().enumerate() {
+            let mut value = *pixel;
+            if let Some([scale, shift]) = &affine {
+                for c in 0..CHANNELS {
+                    value[c] = silu(value[c] * scale[c] + shift[c]);
                 }
-                out[x * factor] = value;
-                out[x * factor + factor - 1] = value;
             }
-        },
-    );
+            out[x * factor] = value;
+            out[x * factor + factor - 1] = value;
+        }
+    });
 }

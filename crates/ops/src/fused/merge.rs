@@ -66,10 +66,7 @@ impl Merge<'_> {
                 None => branch.fill(0.0),
                 Some(Branch { upstream, scale, projection: None }) => {
                     let upstream = &upstream[range.clone()];
-                    vectorized(
-                        #[inline(always)]
-                        || branch.iter_mut().zip(upstream).for_each(|(b, g)| *b = g * scale),
-                    );
+                    vectorized!(|| branch.iter_mut().zip(upstream).for_each(|(b, g)| *b = g * scale));
                 }
                 Some(Branch { upstream, scale, projection: Some(weights) }) => {
                     let row = &upstream[range.clone()];
@@ -82,10 +79,7 @@ impl Merge<'_> {
             }
             if let Some(other) = self.other {
                 let other = &other[range];
-                vectorized(
-                    #[inline(always)]
-                    || branch.iter_mut().zip(other).for_each(|(b, g)| *b += g),
-                );
+                vectorized!(|| branch.iter_mut().zip(other).for_each(|(b, g)| *b += g));
             }
             arch.dispatch(Descend { map: self.map, plane, branch, out });
         }

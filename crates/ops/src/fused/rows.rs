@@ -36,19 +36,16 @@ pub fn halve(doubled: &[f32], out: &mut [f32], add: bool) {
 
 /// Sum over pixels, as four sums side by side, because an addition takes several cycles.
 pub fn sum(pixels: &[f32]) -> [f32; CHANNELS] {
-    vectorized(
-        #[inline(always)]
-        move || {
-            let (quads, rest) = pixels.as_chunks::<{ 4 * CHANNELS }>();
-            let mut sums = [0.0_f32; 4 * CHANNELS];
-            for quad in quads {
-                sums.iter_mut().zip(quad).for_each(|(s, x)| *s += x);
-            }
-            sums.iter_mut().zip(rest).for_each(|(s, x)| *s += x);
-            let pair = |c: usize| sums[c] + sums[c + CHANNELS];
-            std::array::from_fn::<_, CHANNELS, _>(|c| pair(c) + pair(c + 2 * CHANNELS))
-        },
-    )
+    vectorized!(move || {
+        let (quads, rest) = pixels.as_chunks::<{ 4 * CHANNELS }>();
+        let mut sums = [0.0_f32; 4 * CHANNELS];
+        for quad in quads {
+            sums.iter_mut().zip(quad).for_each(|(s, x)| *s += x);
+        }
+        sums.iter_mut().zip(rest).for_each(|(s, x)| *s += x);
+        let pair = |c: usize| sums[c] + sums[c + CHANNELS];
+        std::array::from_fn::<_, CHANNELS, _>(|c| pair(c) + pair(c + 2 * CHANNELS))
+    })
 }
 
 /// Writes a row of the output's gradient to every `stride`-th pixel of `out` `[columns + 2, 16]`; all others stay 0.
@@ -97,19 +94,16 @@ impl WithSimd for Fill<'_> {
 
 /// silu(scale·x + shift) and the slope of SiLU.
 pub fn activate(input: &[f32], [scale, shift]: &Affine, values: &mut [f32], slopes: &mut [f32]) {
-    vectorized(
-        #[inline(always)]
-        move || {
-            let pixels = input.as_chunks::<CHANNELS>().0.iter();
-            let values = values.as_chunks_mut::<CHANNELS>().0.iter_mut();
-            let slopes = slopes.as_chunks_mut::<CHANNELS>().0.iter_mut();
-            for ((pixel, value), slope) in pixels.zip(values).zip(slopes) {
-                for c in 0..CHANNELS {
-                    [value[c], slope[c]] = silu_and_slope(pixel[c] * scale[c] + shift[c]);
-                }
+    vectorized!(move || {
+        let pixels = input.as_chunks::<CHANNELS>().0.iter();
+        let values = values.as_chunks_mut::<CHANNELS>().0.iter_mut();
+        let slopes = slopes.as_chunks_mut::<CHANNELS>().0.iter_mut();
+        for ((pixel, value), slope) in pixels.zip(values).zip(slopes) {
+            for c in 0..CHANNELS {
+                [value[c], slope[c]] = silu_and_slope(pixel[c] * scale[c] + shift[c]);
             }
-        },
-    );
+        }
+    });
 }
 
 /// Multiplies the gradient of SiLU's result by the slope. Returns Σ g and Σ g·(x − centre) of the product g.

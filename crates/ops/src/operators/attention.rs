@@ -150,25 +150,21 @@ impl Attention {
 /// Rotates one head's tokens in place, and scales them. `sign`: 1, or −1 to rotate back.
 fn rotate(x: &mut [f32], d: usize, rope: Tables, factor: f32, sign: f32) {
     let quarter = d / 4;
-    vectorized(
-        #[inline(always)]
-        move || {
-            let tables = rope[0].chunks_exact(d).zip(rope[1].chunks_exact(d));
-            for (x, (cos, sin)) in x.chunks_exact_mut(d).zip(tables) {
-                // Two halves (row, column). The two quarters of a half hold the members of its pairs.
-                for half in [0, 2 * quarter] {
-                    let [cos, sin] =
-                        [cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
-                    let (first, second) = x[half..half + 2 * quarter].split_at_mut(quarter);
-                    for k in 0..quarter {
-                        let (a, b) = (first[k], second[k]);
-                        first[k] = (a * cos.0[k] + b * (sign * sin.0[k])) * factor;
-                        second[k] = (b * cos.1[k] + a * (sign * sin.1[k])) * factor;
-                    }
+    vectorized!(move || {
+        let tables = rope[0].chunks_exact(d).zip(rope[1].chunks_exact(d));
+        for (x, (cos, sin)) in x.chunks_exact_mut(d).zip(tables) {
+            // Two halves (row, column). The two quarters of a half hold the members of its pairs.
+            for half in [0, 2 * quarter] {
+                let [cos, sin] = [cos, sin].map(|values| values[half..half + 2 * quarter].split_at(quarter));
+                let (first, second) = x[half..half + 2 * quarter].split_at_mut(quarter);
+                for k in 0..quarter {
+                    let (a, b) = (first[k], second[k]);
+                    first[k] = (a * cos.0[k] + b * (sign * sin.0[k])) * factor;
+                    second[k] = (b * cos.1[k] + a * (sign * sin.1[k])) * factor;
                 }
             }
-        },
-    );
+        }
+    });
 }
 
 /// Independent accumulators of a reduction, as many as the widest vector has lanes.
@@ -176,65 +172,59 @@ const LANES: usize = 16;
 
 /// Replaces scores by e^(score − row's maximum), and writes ln Σ e^score per row. Returns the sums of the new rows.
 fn exponentials(scores: &mut [f32], keys: usize, logarithms: &mut [f32]) -> Vec<f32> {
-    vectorized(
-        #[inline(always)]
-        move || {
-            let mut all = Vec::with_capacity(logarithms.len());
-            for (row, logarithm) in scores.chunks_exact_mut(keys).zip(logarithms.iter_mut()) {
-                let mut most = [f32::NEG_INFINITY; LANES];
-                let (chunks, rest) = row.as_chunks::<LANES>();
-                for chunk in chunks {
-                    for (m, x) in most.iter_mut().zip(chunk) {
-                        *m = if *x > *m { *x } else { *m };
-                    }
+    vectorized!(move || {
+        let mut all = Vec::with_capacity(logarithms.len());
+        for (row, logarithm) in scores.chunks_exact_mut(keys).zip(logarithms.iter_mut()) {
+            let mut most = [f32::NEG_INFINITY; LANES];
+            let (chunks, rest) = row.as_chunks::<LANES>();
+            for chunk in chunks {
+                for (m, x) in most.iter_mut().zip(chunk) {
+                    *m = if *x > *m { *x } else { *m };
                 }
-                let most = most.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max);
-                let mut sums = [0.0_f32; LANES];
-                let (chunks, rest) = row.as_chunks_mut::<LANES>();
-                for chunk in chunks {
-                    for (s, x) in sums.iter_mut().zip(chunk) {
-                        *x = exp(*x - most);
-                        *s += *x;
-                    }
-                }
-                let mut sum: f32 = sums.iter().sum();
-                for x in rest {
-                    *x = exp(*x - most);
-                    sum += *x;
-                }
-                *logarithm = most + sum.ln();
-                all.push(sum);
             }
-            all
-        },
-    )
+            let most = most.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max);
+            let mut sums = [0.0_f32; LANES];
+            let (chunks, rest) = row.as_chunks_mut::<LANES>();
+            for chunk in chunks {
+                for (s, x) in sums.iter_mut().zip(chunk) {
+                    *x = exp(*x - most);
+                    *s += *x;
+                }
+            }
+            let mut sum: f32 = sums.iter().sum();
+            for x in rest {
+                *x = exp(*x - most);
+                sum += *x;
+            }
+            *logarithm = most + sum.ln();
+            all.push(sum);
+        }
+        all
+    })
 }
 
 /// Replaces scores by their softmax p, and the gradient dp by the gradient of the scores, p · (dp − Σ p·dp).
 fn softmax_gradient(scores: &mut [f32], gradients: &mut [f32], keys: usize, logarithms: &[f32]) {
-    vectorized(
-        #[inline(always)]
-        move || {
-            let rows = scores.chunks_exact_mut(keys).zip(gradients.chunks_exact_mut(keys));
-            for ((scores, gradients), logarithm) in rows.zip(logarithms) {
-                let mut sums = [0.0_f32; LANES];
-                let (chunks, rest) = scores.as_chunks_mut::<LANES>();
-                let (given, given_rest) = gradients.as_chunks::<LANES>();
-                for (chunk, given) in chunks.iter_mut().zip(given) {
-                    for ((s, x), g) in sums.iter_mut().zip(chunk).zip(given) {
-                        *x = exp(*x - logarithm);
-                        *s += *x * g;
-                    }
-                }
-                let mut sum: f32 = sums.iter().sum();
-                for (x, g) in rest.iter_mut().zip(given_rest) {
+    vectorized!(move || {
+        let rows = scores.chunks_exact_mut(keys).zip(gradients.chunks_exact_mut(keys));
+        for ((scores, gradients), logarithm) in rows.zip(logarithms) {
+            let mut sums = [0.0_f32; LANES];
+            let (chunks, rest) = scores.as_chunks_mut::<LANES>();
+            let (given, given_rest) = gradients.as_chunks::<LANES>();
+            for (chunk, given) in chunks.iter_mut().zip(given) {
+                for ((s, x), g) in sums.iter_mut().zip(chunk).zip(given) {
                     *x = exp(*x - logarithm);
-                    sum += *x * g;
-                }
-                for (g, p) in gradients.iter_mut().zip(scores) {
-                    *g = *p * (*g - sum);
+                    *s += *x * g;
                 }
             }
-        },
-    );
+            let mut sum: f32 = sums.iter().sum();
+            for (x, g) in rest.iter_mut().zip(given_rest) {
+                *x = exp(*x - logarithm);
+                sum += *x * g;
+            }
+            for (g, p) in gradients.iter_mut().zip(scores) {
+                *g = *p * (*g - sum);
+            }
+        }
+    });
 }

@@ -59,12 +59,8 @@ impl Convolution {
     }
 
     /// The gradients of some blocks. Returns the weight's and the bias's gradients, empty if unwanted.
-    fn of_blocks(
-        &self,
-        part: &mut [Block],
-        [x, weight, dy]: [&[f32]; 3],
-        [of_input, of_weight, of_bias]: [bool; 3],
-    ) -> (Vec<f32>, Vec<f32>) {
+    fn of_blocks(&self, part: &mut [Block], given: [&[f32]; 3], wanted: [bool; 3]) -> (Vec<f32>, Vec<f32>) {
+        let ([x, weight, dy], [of_input, of_weight, of_bias]) = (given, wanted);
         let (Self { inputs, outputs, rectified, .. }, pixels) = (*self, self.pixels());
         let mut weights = vec![0.0; if of_weight { outputs * inputs } else { 0 }];
         let mut biases = vec![0.0; if of_bias { outputs } else { 0 }];

@@ -31,7 +31,7 @@ impl Layer for Convolution {
 
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, side, side]`, `bias` `[outputs]` →
     /// `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
+    fn forward(&self, [x, weight]: [&[f32]; 2], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
         let out = match (self.side, self.stride) {
             (1, _) => self.pointwise(x, weight, bias),
             (_, 1) => self.winograd(x, weight, bias),

@@ -40,13 +40,7 @@ impl Layer for Linear {
     type Kept = Option<Floats>;
 
     /// x · weight + bias, then GELU if the layer has it: `x` `[rows, inputs]` → `[rows, outputs]`.
-    fn forward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        bias: Option<&[f32]>,
-        keep: bool,
-    ) -> (Vec<f32>, Option<Floats>) {
+    fn forward(&self, [x, weight]: [&[f32]; 2], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept) {
         let (size, piece) = (self.rows * self.outputs, ROWS * self.outputs);
         let (mut out, mut before) = (take(size), (self.gelu && keep).then(|| Floats::new(size)));
         let weight = Right::new(self.in_bf16, [self.inputs, self.outputs], (weight, self.strides()));
@@ -55,18 +49,12 @@ impl Layer for Linear {
         tasks.zip(kept).for_each(|((out, x), before)| match before {
             Some(before) => {
                 self.product(x, &weight, bias, before);
-                vectorized(
-                    #[inline(always)]
-                    || out.iter_mut().zip(before.iter()).for_each(|(out, z)| *out = gelu(*z)),
-                );
+                vectorized!(|| out.iter_mut().zip(before.iter()).for_each(|(out, z)| *out = gelu(*z)));
             }
             None => {
                 self.product(x, &weight, bias, out);
                 if self.gelu {
-                    vectorized(
-                        #[inline(always)]
-                        || out.iter_mut().for_each(|out| *out = gelu(*out)),
-                    );
+                    vectorized!(|| out.iter_mut().for_each(|out| *out = gelu(*out)));
                 }
             }
         });
@@ -142,12 +130,9 @@ impl Linear {
 
 /// dz = dy · gelu'(z).
 fn derive(z: &[f32], dy: &[f32], dz: &mut [f32]) {
-    vectorized(
-        #[inline(always)]
-        || {
-            for ((dz, z), dy) in dz.iter_mut().zip(z).zip(dy) {
-                *dz = dy * gelu_derivative(*z);
-            }
-        },
-    );
+    vectorized!(|| {
+        for ((dz, z), dy) in dz.iter_mut().zip(z).zip(dy) {
+            *dz = dy * gelu_derivative(*z);
+        }
+    });
 }

@@ -35,8 +35,8 @@ pub trait Layer: Debug + Send + Sync + 'static {
     /// Values that the backward pass needs beside the input and the weight.
     type Kept: Send + 'static;
 
-    /// `keep`: a backward pass will follow.
-    fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept);
+    /// `given`: the input and the weight. `keep`: a backward pass will follow.
+    fn forward(&self, given: [&[f32]; 2], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept);
 
     /// The wanted gradients of the input, the weight and the bias, from the input, the weight and the result's gradient.
     /// Unwanted gradients cost nothing.

@@ -28,13 +28,7 @@ impl Layer for LayerNorm {
     type Kept = Vec<Statistics>;
 
     /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]` and each row's statistics.
-    fn forward(
-        &self,
-        x: &[f32],
-        weight: &[f32],
-        bias: Option<&[f32]>,
-        _keep: bool,
-    ) -> (Vec<f32>, Vec<Statistics>) {
+    fn forward(&self, [x, weight]: [&[f32]; 2], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, Self::Kept) {
         let bias = bias.expect("the published norms have biases");
         let mut out = take(x.len());
         let mut statistics = vec![[0.0; 2]; x.len() / self.channels];
@@ -45,12 +39,8 @@ impl Layer for LayerNorm {
     }
 
     /// If the gradient of weight or bias is wanted, both are computed.
-    fn backward(
-        &self,
-        [x, weight, dy]: [&[f32]; 3],
-        statistics: Vec<Statistics>,
-        [of_input, of_weight, of_bias]: [bool; 3],
-    ) -> InputGradients {
+    fn backward(&self, given: [&[f32]; 3], statistics: Self::Kept, wanted: [bool; 3]) -> InputGradients {
+        let ([x, weight, dy], [of_input, of_weight, of_bias]) = (given, wanted);
         let (c, piece) = (self.channels, ROWS * self.channels);
         let blocks = statistics.len().div_ceil(ROWS);
         let summed = of_weight || of_bias;
@@ -92,62 +82,47 @@ fn sum<const N: usize>(slices: [&[f32]; N], f: impl Fn([f32; N]) -> f32) -> f32 
 
 impl LayerNorm {
     /// Normalises rows, and writes their statistics.
-    fn normalise(
-        self,
-        x: &[f32],
-        [weight, bias]: [&[f32]; 2],
-        out: &mut [f32],
-        statistics: &mut [Statistics],
-    ) {
-        let c = self.channels;
-        vectorized(
-            #[inline(always)]
-            move || {
-                let rows = x.chunks_exact(c).zip(out.chunks_exact_mut(c)).zip(statistics.iter_mut());
-                for ((x, out), statistics) in rows {
-                    let mean = sum([x], |[x]| x) / c as f32;
-                    let variance = sum([x], |[x]| (x - mean) * (x - mean)) / c as f32;
-                    let scale = 1.0 / (variance + self.epsilon).sqrt();
-                    *statistics = [mean, scale];
-                    for (((out, x), w), b) in out.iter_mut().zip(x).zip(weight).zip(bias) {
-                        *out = (x - mean) * scale * w + b;
-                    }
+    fn normalise(self, x: &[f32], factors: [&[f32]; 2], out: &mut [f32], statistics: &mut [Statistics]) {
+        let (c, [weight, bias]) = (self.channels, factors);
+        vectorized!(move || {
+            let rows = x.chunks_exact(c).zip(out.chunks_exact_mut(c)).zip(statistics.iter_mut());
+            for ((x, out), statistics) in rows {
+                let mean = sum([x], |[x]| x) / c as f32;
+                let variance = sum([x], |[x]| (x - mean) * (x - mean)) / c as f32;
+                let scale = 1.0 / (variance + self.epsilon).sqrt();
+                *statistics = [mean, scale];
+                for (((out, x), w), b) in out.iter_mut().zip(x).zip(weight).zip(bias) {
+                    *out = (x - mean) * scale * w + b;
                 }
-            },
-        );
+            }
+        });
     }
 }
 
 /// dx = scale · (g − mean(g) − h · mean(g·h)), with the normalised row h and g = dy·weight.
 fn derive(x: &[f32], dy: &[f32], weight: &[f32], statistics: &[Statistics], dx: &mut [f32]) {
     let c = weight.len();
-    vectorized(
-        #[inline(always)]
-        move || {
-            let rows = x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(dx.chunks_exact_mut(c));
-            for (((x, dy), dx), &[mean, scale]) in rows.zip(statistics) {
-                let constant = sum([dy, weight], |[dy, w]| dy * w) / c as f32;
-                let slope = sum([dy, weight, x], |[dy, w, x]| dy * w * ((x - mean) * scale)) / c as f32;
-                for (((dx, x), dy), w) in dx.iter_mut().zip(x).zip(dy).zip(weight) {
-                    *dx = (dy * w - constant - (x - mean) * scale * slope) * scale;
-                }
+    vectorized!(move || {
+        let rows = x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(dx.chunks_exact_mut(c));
+        for (((x, dy), dx), &[mean, scale]) in rows.zip(statistics) {
+            let constant = sum([dy, weight], |[dy, w]| dy * w) / c as f32;
+            let slope = sum([dy, weight, x], |[dy, w, x]| dy * w * ((x - mean) * scale)) / c as f32;
+            for (((dx, x), dy), w) in dx.iter_mut().zip(x).zip(dy).zip(weight) {
+                *dx = (dy * w - constant - (x - mean) * scale * slope) * scale;
             }
-        },
-    );
+        }
+    });
 }
 
 /// Column sums of dy·h (`weight`) and dy (`bias`), with the normalised row h.
 fn column_sums(x: &[f32], dy: &[f32], statistics: &[Statistics], (weight, bias): (&mut [f32], &mut [f32])) {
     let c = weight.len();
-    vectorized(
-        #[inline(always)]
-        move || {
-            for ((x, dy), &[mean, scale]) in x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(statistics) {
-                for (((weight, bias), x), dy) in weight.iter_mut().zip(&mut *bias).zip(x).zip(dy) {
-                    *weight += dy * ((x - mean) * scale);
-                    *bias += dy;
-                }
+    vectorized!(move || {
+        for ((x, dy), &[mean, scale]) in x.chunks_exact(c).zip(dy.chunks_exact(c)).zip(statistics) {
+            for (((weight, bias), x), dy) in weight.iter_mut().zip(&mut *bias).zip(x).zip(dy) {
+                *weight += dy * ((x - mean) * scale);
+                *bias += dy;
             }
-        },
-    );
+        }
+    });
 }

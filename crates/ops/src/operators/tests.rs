@@ -62,9 +62,21 @@ fn check<M: Module, const A: usize, const D: usize>(
     }
 }
 
+/// Compares a convolution, also of max(x, 0), with a padding of half a kernel.
+fn check_convolution([batch, inputs, outputs, height, width]: [usize; 5], side: usize, stride: usize) {
+    let half = side / 2;
+    let layer = Conv2dConfig::new([inputs, outputs], [side; 2]).with_stride([stride; 2]);
+    let layer = layer.with_padding(PaddingConfig2d::Explicit(half, half, half, half));
+    for rectified in [false, true] {
+        let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}, stride {stride}, {rectified}");
+        let layer = layer.init(&Device::flex().autodiff());
+        check(&what, layer, [batch, inputs, height, width], |l, x| layers::conv2d(l, x, rectified));
+    }
+}
+
 #[test]
 fn convolutions_of_three_taps_equal_burns() {
-    let sizes = [
+    for size in [
         [1, 1, 1, 1, 1],
         [2, 5, 7, 2, 3],
         [1, 16, 48, 9, 13],
@@ -72,19 +84,8 @@ fn convolutions_of_three_taps_equal_burns() {
         [1, 3, 2, 5, 700],
         [2, 20, 40, 18, 33],
         [3, 5, 18, 19, 21],
-    ];
-    for ([batch, inputs, outputs, height, width], stride) in
-        sizes.into_iter().flat_map(|size| [1, 2].map(|stride| (size, stride)))
-    {
-        let padding = PaddingConfig2d::Explicit(1, 1, 1, 1);
-        let layer =
-            Conv2dConfig::new([inputs, outputs], [3, 3]).with_stride([stride; 2]).with_padding(padding);
-        for rectified in [false, true] {
-            let what =
-                format!("{batch}×{inputs}→{outputs} at {height}×{width}, stride {stride}, {rectified}");
-            let layer = layer.init(&Device::flex().autodiff());
-            check(&what, layer, [batch, inputs, height, width], |l, x| layers::conv2d(l, x, rectified));
-        }
+    ] {
+        [1, 2].into_iter().for_each(|stride| check_convolution(size, 3, stride));
     }
 }
 
@@ -108,14 +109,8 @@ fn taps_that_see_nothing_have_no_gradient() {
 
 #[test]
 fn convolutions_of_one_tap_equal_burns() {
-    for [batch, inputs, outputs, height, width] in
-        [[1, 1, 1, 1, 1], [2, 35, 4, 9, 7], [3, 20, 40, 1, 300], [1, 4, 3, 130, 90]]
-    {
-        for rectified in [false, true] {
-            let layer = Conv2dConfig::new([inputs, outputs], [1, 1]).init(&Device::flex().autodiff());
-            let what = format!("{batch}×{inputs}→{outputs} at {height}×{width}, {rectified}");
-            check(&what, layer, [batch, inputs, height, width], |l, x| layers::conv2d(l, x, rectified));
-        }
+    for size in [[1, 1, 1, 1, 1], [2, 35, 4, 9, 7], [3, 20, 40, 1, 300], [1, 4, 3, 130, 90]] {
+        check_convolution(size, 1, 1);
     }
 }
 
@@ -182,10 +177,10 @@ fn rotary_attention_equals_burns() {
             if has_kernels(&q) {
                 let in_bf16 = is_bf16(&pairs.keys);
                 let [k, v] = [k, v].map(|x| x.cast(FloatDType::F32));
-                return rotary_attention(q, k, v, &rope, heads, in_bf16);
+                return rotary_attention([q, k, v], &rope, heads, in_bf16);
             }
             let [cos, sin] = [&rope.cos, &rope.sin].map(|table| table.clone().cast(FloatDType::F64));
-            plain_attention(q, k, v, &Rope { cos, sin }, heads)
+            plain_attention([q, k, v], &Rope { cos, sin }, heads)
         };
         let pairs = Pairs { keys: zeros(), values: zeros() };
         check(&format!("{rows}×{columns} tokens"), pairs, [batch, n, c], run);
@@ -206,8 +201,8 @@ fn resizing_equals_burns() {
 /// Results and gradients of all operators, at sizes that need several tasks.
 fn everything(in_bf16: bool) -> Vec<Vec<f32>> {
     fn add<L: Layer>(all: &mut Vec<Vec<f32>>, layer: &L, [x, weight, bias, dy]: [&[f32]; 4]) {
-        let (result, kept) = layer.forward(x, weight, Some(bias), true);
-        assert_eq!(layer.forward(x, weight, Some(bias), false).0, result);
+        let (result, kept) = layer.forward([x, weight], Some(bias), true);
+        assert_eq!(layer.forward([x, weight], Some(bias), false).0, result);
         all.push(result);
         all.extend(layer.backward([x, weight, dy], kept, [true; 3]).into_iter().flatten());
     }

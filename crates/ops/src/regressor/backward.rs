@@ -199,13 +199,7 @@ impl Pass<'_> {
     }
 
     /// The backward pass of a convolution of normalised and activated planes.
-    fn normalised(
-        &mut self,
-        norm: &Norm,
-        planes: &[&Plane],
-        weights: &[f32],
-        upstream: Upstream,
-    ) -> Gradients {
+    fn normalised(&self, norm: &Norm, planes: &[&Plane], weights: &[f32], upstream: Upstream) -> Gradients {
         let affines = self.network.norm(norm, self.parameters).affines(&self.sample.layers[norm.index]);
         let pairs = planes.iter().zip(affines);
         let sources: Vec<_> = pairs.map(|(&plane, affine)| Source { plane, affine: Some(affine) }).collect();

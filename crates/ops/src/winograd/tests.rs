@@ -20,7 +20,8 @@ fn winograd_is_accurate() {
     let (inputs, outputs, height, width) = (channels, channels, side, side);
     let (stride, rectified, in_bf16) = (1, false, false);
     let layer = Convolution { batch: 1, inputs, outputs, height, width, side: 3, stride, rectified, in_bf16 };
-    let (got, ()) = layer.forward(&host(x.clone()), &host(weight.clone()), Some(&host(bias.clone())), false);
+    let (got, ()) =
+        layer.forward([&host(x.clone()), &host(weight.clone())], Some(&host(bias.clone())), false);
     let [x, weight] = [x, weight].map(|tensor| tensor.cast(FloatDType::F64));
     let options = ConvOptions::new([1, 1], [1, 1], [1, 1], 1);
     let exact = conv2d(x, weight, Some(bias.cast(FloatDType::F64)), options);

@@ -102,34 +102,31 @@ pub fn filters(
 ) {
     let rows = inputs.next_multiple_of(GROUP);
     let (out, _) = out.as_chunks_mut::<PANEL>();
-    vectorized(
-        #[inline(always)]
-        move || {
-            for k in 0..rows {
-                let mut g = [[0.0; PANEL]; 9];
-                if k < inputs {
-                    for o in 0..outputs {
-                        let filter = &weights[o * strides[0] + k * strides[1]..];
-                        let filter: &[f32; 9] = filter.first_chunk().expect("nine taps");
-                        for tap in 0..9 {
-                            g[tap][o] = filter[if turned { 8 - tap } else { tap }];
-                        }
-                    }
-                }
-                let columns = [
-                    filter_points(&g[0], &g[3], &g[6]),
-                    filter_points(&g[1], &g[4], &g[7]),
-                    filter_points(&g[2], &g[5], &g[8]),
-                ];
-                for y in 0..SPAN {
-                    let row = filter_points(&columns[0][y], &columns[1][y], &columns[2][y]);
-                    for (x, values) in row.iter().enumerate() {
-                        out[(SPAN * y + x) * rows + k] = *values;
+    vectorized!(move || {
+        for k in 0..rows {
+            let mut g = [[0.0; PANEL]; 9];
+            if k < inputs {
+                for o in 0..outputs {
+                    let filter = &weights[o * strides[0] + k * strides[1]..];
+                    let filter: &[f32; 9] = filter.first_chunk().expect("nine taps");
+                    for tap in 0..9 {
+                        g[tap][o] = filter[if turned { 8 - tap } else { tap }];
                     }
                 }
             }
-        },
-    );
+            let columns = [
+                filter_points(&g[0], &g[3], &g[6]),
+                filter_points(&g[1], &g[4], &g[7]),
+                filter_points(&g[2], &g[5], &g[8]),
+            ];
+            for y in 0..SPAN {
+                let row = filter_points(&columns[0][y], &columns[1][y], &columns[2][y]);
+                for (x, values) in row.iter().enumerate() {
+                    out[(SPAN * y + x) * rows + k] = *values;
+                }
+            }
+        }
+    });
 }
 
 /// Bᵀ·d·B of every tile of a block: `[36][groups][stride][16]`.

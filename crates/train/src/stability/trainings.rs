@@ -16,7 +16,6 @@ use snapsnap_people::{Detail, synth};
 use tempfile::TempDir;
 
 use super::config;
-use crate::TrainError;
 use crate::config::TrainConfig;
 use crate::data::Data;
 use crate::log::Line;
@@ -25,7 +24,8 @@ use crate::ranks::Ranks;
 use crate::run::{Options, Outcome, Watch, on_best_thread, train};
 use crate::stage1::PointTask;
 use crate::stage2::GaussianTask;
-use crate::task::{Moment, Part, Task, Validation};
+use crate::task::{Moment, Part, Task};
+use crate::{Result, TrainError};
 use snapsnap_net::Window;
 
 /// Stiff trainings, and one sample whose loss is not a number (docs/method.md, "Stability cases").
@@ -43,27 +43,22 @@ pub(super) fn cases() -> Vec<Case> {
 }
 
 /// A case that does not depend on the device.
-fn case(input: &str, holds: &str, run: impl Fn() -> Result<Found, TrainError> + 'static) -> Case {
+fn case(input: &str, holds: &str, run: impl Fn() -> Result<Found> + 'static) -> Case {
     let run = move |_: &Device| run().unwrap_or_else(Found::broken);
     Case { area: "Stiff training", once: true, ..super::case(input, holds, 0.0, run) }
 }
 
-fn temporary() -> Result<TempDir, TrainError> {
+fn temporary() -> Result<TempDir> {
     tempfile::tempdir().map_err(|e| TrainError::Unsuitable(format!("cannot make a temporary folder: {e}")))
 }
 
-struct Silent {
-    finite: bool,
-}
+/// Whether all logged numbers are finite.
+struct AllFinite(bool);
 
-impl Watch for Silent {
+impl Watch for AllFinite {
     fn step(&mut self, line: &Line, _: u64, _: u64) {
-        self.finite &= line.values.values().all(|value| value.is_finite());
+        self.0 &= line.values.values().all(|value| value.is_finite());
     }
-
-    fn validated(&mut self, _: u64, _: &Validation) {}
-
-    fn note(&mut self, _: &str) {}
 }
 
 /// A short training in a temporary folder: its outcome, and whether all logged numbers are finite. Weights that
@@ -73,24 +68,17 @@ fn trained<T: Task>(
     config: &TrainConfig,
     networks: Networks,
     device: &Device,
-) -> Result<(Outcome, bool), TrainError> {
-    let folder = temporary()?;
-    let stop = AtomicBool::new(false);
-    let options = Options {
-        folder: folder.path(),
-        device,
-        ranks: &Ranks::default(),
-        limit: None,
-        stop: &stop,
-        force: false,
-    };
-    let mut watch = Silent { finite: true };
+) -> Result<(Outcome, bool)> {
+    let (temporary, ranks, stop) = (temporary()?, Ranks::default(), AtomicBool::new(false));
+    let folder = temporary.path();
+    let options = Options { folder, device, ranks: &ranks, limit: None, stop: &stop, force: false };
+    let mut watch = AllFinite(true);
     let outcome = on_best_thread(device, || train(task, config, networks, &options, &mut watch))?;
-    Ok((outcome, watch.finite))
+    Ok((outcome, watch.0))
 }
 
 /// A data set of extreme people: nearly black, over-exposed, in 1 % of the frame, and in nearly all of it.
-fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
+fn extreme_people(root: &Path) -> Result<Arc<Folder>> {
     let mut data = DataConfig::default();
     (data.views.count, data.views.resolution) = (4, 64);
     let person = synth::person("stability", None, Detail::Fine);
@@ -110,10 +98,10 @@ fn extreme_people(root: &Path) -> Result<Arc<Folder>, TrainError> {
     Ok(data.make(&root.join("people"), "stability", people)?)
 }
 
-fn stiff(factor: f64) -> Result<Found, TrainError> {
+fn stiff(factor: f64) -> Result<Found> {
     let temporary = temporary()?;
     let folder = extreme_people(temporary.path())?;
-    let share = |subject: &str| -> Result<f64, TrainError> {
+    let share = |subject: &str| -> Result<f64> {
         let (_, mask) = folder.person(Some(Split::Train), subject).picture(0, false)?;
         Ok(mask.as_raw().iter().filter(|m| **m > 127).count() as f64 / 4096.0)
     };
@@ -162,12 +150,7 @@ impl Task for Poisoned {
         self.0.extent(items)
     }
 
-    fn losses(
-        &self,
-        networks: &Networks,
-        items: Vec<Stage1Item>,
-        at: Moment,
-    ) -> Result<Vec<Part>, TrainError> {
+    fn losses(&self, networks: &Networks, items: Vec<Stage1Item>, at: Moment) -> Result<Vec<Part>> {
         let is_poisoned = at.step == 3;
         let mut parts = self.0.losses(networks, items, at)?;
         if is_poisoned {
@@ -177,7 +160,7 @@ impl Task for Poisoned {
     }
 }
 
-fn poisoned() -> Result<Found, TrainError> {
+fn poisoned() -> Result<Found> {
     let temporary = temporary()?;
     let folder = extreme_people(temporary.path())?;
     let config = config(&["training.steps=8".into()]);

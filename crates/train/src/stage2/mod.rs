@@ -21,7 +21,7 @@ use snapsnap_net::{Prediction, Window};
 use snapsnap_ops::{host, mean};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
-use crate::TrainError;
+use crate::Result;
 use crate::config::{Stage1Config, Stage2Config, TrainConfig};
 use crate::data::Data;
 use crate::networks::Networks;
@@ -64,13 +64,13 @@ impl GaussianTask {
     /// without autodiff, or `None` if it is trained as well.
     ///
     /// # Errors
-    /// [`TrainError`] if a data set cannot be used with this config.
+    /// [`TrainError`](crate::TrainError) if a data set cannot be used with this config.
     pub fn new(
         folders: &[Arc<Folder>],
         config: &TrainConfig,
         predictor: Option<PointPredictor>,
         device: &Device,
-    ) -> Result<Self, TrainError> {
+    ) -> Result<Self> {
         let points = config.stage2.points_weight > 0.0;
         // Second surfaces are trained in stage 1 alone.
         let samples = SampleConfig { points, second_depth: false, ..config.samples() };
@@ -112,7 +112,7 @@ impl GaussianTask {
     /// Scores of the billboard baseline: both photographs as flat cut-outs in the plane through the person's axis. Its
     /// points are the ray anchors, which lie on that plane. The last layer of a regressor with a geometric start is
     /// zero, so that random weights leave each Gaussian in its pixel's colour. Confidences of 0 leave the sides out.
-    fn billboard(&self, ranks: &Ranks) -> Result<[f64; 4], TrainError> {
+    fn billboard(&self, ranks: &Ranks) -> Result<[f64; 4]> {
         if let Some(scores) = self.billboard_scores.get() {
             return Ok(*scores);
         }
@@ -130,23 +130,18 @@ impl GaussianTask {
             };
             let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
             let gaussians = gaussians(&config, &networks, &item, prediction, &Phase::new(false, 0), device);
-            Ok(sums.add(&item, self.render(&gaussians, &item.target_cameras, item.background)?.0)?)
+            Ok(sums.add(&item, pictures(&gaussians, &item.target_cameras, item.background)?.0)?)
         })?;
         Ok(*self.billboard_scores.get_or_init(|| Scores::mean(&all)))
     }
+}
 
-    /// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`. Without Gaussians the pictures show the background.
-    fn render(
-        &self,
-        gaussians: &Gaussians,
-        cameras: &[Camera],
-        background: [f32; 3],
-    ) -> Result<(Tensor<4>, Tensor<3>), TrainError> {
-        let color = Tensor::<1>::from_floats(background, &gaussians.device());
-        let options = RenderOptions { background: Some(color), ..RenderOptions::inria() };
-        let rendered = render(gaussians, cameras, &options)?;
-        Ok((rendered.color.permute([0, 3, 1, 2]), rendered.alpha))
-    }
+/// Rendered pictures `[V,3,h,w]` and coverage `[V,h,w]`. Without Gaussians the pictures show the background.
+fn pictures(shown: &Gaussians, cameras: &[Camera], background: [f32; 3]) -> Result<(Tensor<4>, Tensor<3>)> {
+    let color = Tensor::<1>::from_floats(background, &shown.device());
+    let options = RenderOptions { background: Some(color), ..RenderOptions::inria() };
+    let rendered = render(shown, cameras, &options)?;
+    Ok((rendered.color.permute([0, 3, 1, 2]), rendered.alpha))
 }
 
 impl Task for GaussianTask {
@@ -161,12 +156,8 @@ impl Task for GaussianTask {
         &item.name
     }
 
-    fn losses(
-        &self,
-        networks: &Networks,
-        items: Vec<Stage2Item>,
-        Moment { step, first, .. }: Moment,
-    ) -> Result<Vec<Part>, TrainError> {
+    fn losses(&self, networks: &Networks, items: Vec<Stage2Item>, at: Moment) -> Result<Vec<Part>> {
+        let Moment { step, first, .. } = at;
         let (phase, device) = (Phase::new(self.loss_config.curriculum, step), &self.device);
         let mut sums: BTreeMap<&'static str, (f64, Vec<Tensor<1>>)> = BTreeMap::new();
         let config = &self.loss_config;
@@ -197,7 +188,7 @@ impl Task for GaussianTask {
                 continue;
             }
             let cameras: Vec<Camera> = chosen.iter().map(|v| item.target_cameras[*v]).collect();
-            let (image, coverage) = self.render(&gaussians, &cameras, item.background)?;
+            let (image, coverage) = pictures(&gaussians, &cameras, item.background)?;
             let (target, mask) = targets(item, &chosen, device);
             let [l1, ssim] = photometric(image, target);
             add("l1", L1_SHARE, l1);
@@ -215,13 +206,13 @@ impl Task for GaussianTask {
         Ok(sums.into_iter().map(mean).collect())
     }
 
-    fn validate(&self, networks: &Networks, ranks: &Ranks) -> Result<Option<Validation>, TrainError> {
+    fn validate(&self, networks: &Networks, ranks: &Ranks) -> Result<Option<Validation>> {
         if self.data.count == 0 {
             return Ok(None);
         }
         let all = self.data.validated(ranks, |sums: &mut Scores, item| {
             let gaussians = self.whole(networks, &item);
-            Ok(sums.add(&item, self.render(&gaussians, &item.target_cameras, item.background)?.0)?)
+            Ok(sums.add(&item, pictures(&gaussians, &item.target_cameras, item.background)?.0)?)
         })?;
         let [full, masked, sides, ssim] = Scores::mean(&all);
         let [_, billboard_masked, billboard_sides, _] = self.billboard(ranks)?;
@@ -236,7 +227,7 @@ impl Task for GaussianTask {
         Ok(Some(Validation { score: -masked, figures }))
     }
 
-    fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>, TrainError> {
+    fn preview(&self, networks: &Networks) -> Result<Option<RgbImage>> {
         let mut rows = Vec::new();
         for item in self.data.validation(PREVIEWS) {
             let item = item?;
@@ -249,7 +240,7 @@ impl Task for GaussianTask {
             let mut row = vec![photo(0), photo(1)];
             let views = [0, item.target_cameras.len() - 2];
             let cameras = views.map(|v| item.target_cameras[v]);
-            let seen = host(self.render(&self.whole(networks, &item), &cameras, item.background)?.0);
+            let seen = host(pictures(&self.whole(networks, &item), &cameras, item.background)?.0);
             let (side, area) = (item.target_side, item.target_side.pow(2));
             for (place, view) in views.into_iter().enumerate() {
                 let at = |values: &[f32], view: usize, i: usize| {

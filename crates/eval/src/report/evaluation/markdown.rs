@@ -29,7 +29,7 @@ impl Evaluation<'_> {
         self.alignment_markdown(&mut text);
         for (i, protocol) in self.protocols() {
             let row = |judged: &Judged| {
-                let people = by_person(&judged.rows, i);
+                let people = by_person(judged.rows.iter(), i);
                 let counts = [people.len().to_string(), judged.rows.len().to_string()];
                 let sides = cell(Self::sides(judged, i), 1.0, 2);
                 [scores(&judged.name, counts, &Self::overall(&people)), vec![sides]].concat()

@@ -115,7 +115,7 @@ impl Evaluation<'_> {
         };
         let plain = |judged: &Judged| {
             self.by_protocol(|protocol| {
-                let mut value = figures(&Self::overall(&by_person(&judged.rows, protocol)));
+                let mut value = figures(Self::overall(&by_person(judged.rows.iter(), protocol)));
                 value["sides_psnr"] = json!(Self::sides(judged, protocol));
                 value
             })
@@ -127,7 +127,7 @@ impl Evaluation<'_> {
         report["baselines_geometry_cm"] = named(Kind::Baseline, &|judged| geometry_json(&judged.surface));
         report["compared"] = named(Kind::Other, &|judged| {
             let difference = |protocol: usize| match self.model() {
-                Some(model) => figures(&Self::difference(judged, model, protocol)),
+                Some(model) => figures(Self::difference(judged, model, protocol)),
                 None => Value::Null,
             };
             json!({
@@ -159,14 +159,14 @@ impl Evaluation<'_> {
     }
 
     fn protocol_json(&self, model: &Judged, protocol: usize) -> Value {
-        let people = by_person(&model.rows, protocol);
+        let people = by_person(model.rows.iter(), protocol);
         let subject = |(person, score): (&usize, &Score)| {
             let mut value = json!(score);
             value["name"] = json!(self.outcome.people[*person]);
             value
         };
         json!({
-            "overall": figures(&Self::overall(&people)),
+            "overall": figures(Self::overall(&people)),
             "sides_psnr": Self::sides(model, protocol),
             "people": people.len(),
             "views": model.rows.len(),
@@ -214,7 +214,7 @@ impl Evaluation<'_> {
         let Some((model, (protocol, _))) = self.model().zip(self.protocols().last()) else {
             return Vec::new();
         };
-        let mut people: Vec<(usize, Score)> = by_person(&model.rows, protocol).into_iter().collect();
+        let mut people: Vec<(usize, Score)> = by_person(model.rows.iter(), protocol).into_iter().collect();
         people.sort_by(|a, b| b.1.psnr.total_cmp(&a.1.psnr));
         let n = people.len();
         let starts = [0, (n / 2).saturating_sub(count / 2), n.saturating_sub(count)];
@@ -229,13 +229,17 @@ fn of_sides(judged: &Judged) -> impl Iterator<Item = &Row> {
     judged.rows.iter().filter(|row| SIDES.contains(&(row.degrees % 180.0).round()))
 }
 
-fn photographs_json(judged: &Judged) -> Value {
-    let [masks, foreign, beside] = Evaluation::photographs(judged);
-    json!({ "mask_iou": masks, "foreign_share": foreign, "beside_share": beside })
+/// Figures by their names.
+fn by_name<const N: usize>(names: [&str; N], figures: [impl Serialize; N]) -> Value {
+    names.into_iter().zip(figures).map(|(name, figure)| (name, json!(figure))).collect()
 }
 
-fn figures(intervals: &[Option<Interval>; 3]) -> Value {
-    FIGURES.iter().zip(intervals).map(|((name, ..), interval)| (*name, json!(interval))).collect()
+fn photographs_json(judged: &Judged) -> Value {
+    by_name(["mask_iou", "foreign_share", "beside_share"], Evaluation::photographs(judged))
+}
+
+fn figures(intervals: [Option<Interval>; 3]) -> Value {
+    by_name(FIGURES.map(|(name, ..)| name), intervals)
 }
 
 /// Means over people: distance in mm, distance after centring in mm, share of missed points.
@@ -253,11 +257,8 @@ fn part_means(judged: &Judged, part: usize) -> [Option<f64>; 3] {
 }
 
 fn parts_json(judged: &Judged) -> Value {
-    let part = |(i, name): (usize, &&'static str)| {
-        let [relief, normals, far] = part_means(judged, i);
-        (*name, json!({ "relief_mm": relief, "normals_degrees": normals, "far_percent": far }))
-    };
-    PARTS.iter().enumerate().map(part).collect()
+    const NAMES: [&str; 3] = ["relief_mm", "normals_degrees", "far_percent"];
+    by_name(PARTS, std::array::from_fn(|part| by_name(NAMES, part_means(judged, part))))
 }
 
 /// Means over people: degrees, centimetres, scale.
@@ -267,12 +268,8 @@ fn alignment_means(judged: &Judged) -> Option<[f64; 3]> {
 }
 
 fn points_json(judged: &Judged) -> Value {
-    let view = |(i, name): (usize, &&'static str)| {
-        let value = point_means(judged, i)
-            .map(|[mean, centred, missed]| json!({ "mean": mean, "centred": centred, "missed": missed }));
-        (*name, json!(value))
-    };
-    VIEWS.iter().enumerate().map(view).collect()
+    let of_view = |view| point_means(judged, view).map(|means| by_name(["mean", "centred", "missed"], means));
+    by_name(VIEWS, std::array::from_fn(of_view))
 }
 
 /// Means over people: distances in cm to the truth, from the truth and both; cosine of normals; open share.
@@ -289,14 +286,8 @@ fn surface_intervals(surfaces: &[Surface]) -> [Option<Interval>; 5] {
 }
 
 fn geometry_json(surfaces: &[Surface]) -> Value {
-    let [forward, backward, mean, normals, open] = surface_intervals(surfaces);
-    json!({
-        "to_truth": forward,
-        "from_truth": backward,
-        "chamfer": mean,
-        "normal_consistency": normals,
-        "open_share": open,
-    })
+    const NAMES: [&str; 5] = ["to_truth", "from_truth", "chamfer", "normal_consistency", "open_share"];
+    by_name(NAMES, surface_intervals(surfaces))
 }
 
 /// Seconds, p50 and p95.
@@ -306,5 +297,5 @@ fn seconds(judged: &Judged) -> Option<[f64; 2]> {
 }
 
 fn seconds_json(judged: &Judged) -> Value {
-    json!(seconds(judged).map(|[p50, p95]| json!({ "p50": p50, "p95": p95 })))
+    json!(seconds(judged).map(|times| by_name(["p50", "p95"], times)))
 }
