@@ -12,11 +12,12 @@ use std::time::Instant;
 use snapsnap_tests::{data, root, sample, shared, snapsnap, succeed, toml_config};
 
 /// In reading order: a page's commands use the outputs of earlier pages.
-const PAGES: [&str; 14] = [
+const PAGES: [&str; 15] = [
     "README.md",
     "CONTRIBUTING.md",
     "docs/training.md",
     "docs/look.md",
+    "docs/python.md",
     "docs/weights.md",
     "docs/evaluation.md",
     "docs/formats.md",
@@ -33,7 +34,7 @@ const TASKS: [&str; 6] = ["test", "lint", "dist", "fuzz", "bundle", "help"];
 /// Records the commands that the shell would start. Byte 0x1F ends an argument, 0x1E a command.
 const RECORDER: &str = r#"set -eu
 record() { { printf '%s\037' "$@"; printf '\036'; } >> "$COMMANDS"; }
-for program in cargo snapsnap python bash; do eval "$program() { record $program \"\$@\"; }"; done
+for program in cargo snapsnap python pip bash; do eval "$program() { record $program \"\$@\"; }"; done
 touch() { :; }
 "#;
 
@@ -113,6 +114,7 @@ fn look(words: &[String]) {
         }
         ["python", file, ..] => root().join(file).is_file(),
         ["cargo", "doc", ..] => true,
+        ["pip", "install", folder] => root().join(folder).join("pyproject.toml").is_file(),
         ["cargo", "install", "--locked", "--path", folder] => {
             root().join(folder).join("Cargo.toml").is_file()
         }

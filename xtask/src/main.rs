@@ -69,6 +69,11 @@ fn features() -> Option<&'static str> {
     None
 }
 
+/// Features of the tests' build: the Python package, and the program's.
+fn built_features(program: Option<&str>) -> String {
+    ["snapsnap-python/python"].into_iter().chain(program).collect::<Vec<_>>().join(",")
+}
+
 fn has_libclang() -> bool {
     /// Starts of the library's names with and without a version, not of its relatives such as `libclang-cpp`.
     const NAMES: [&str; 4] = ["libclang.so", "libclang.dylib", "libclang-1", "libclang-2"];
@@ -88,7 +93,8 @@ fn has_libclang() -> bool {
 fn test(filter: &[String]) -> bool {
     let mut all = vec!["test", "--release", "--workspace", "--no-fail-fast"];
     let features = features();
-    all.extend(features.into_iter().flat_map(|features| ["--features", features]));
+    let built = built_features(features);
+    all.extend(["--features", &built]);
     let numerical = ["--test", "numerical"];
     let filter = || ["--"].into_iter().chain(filter.iter().map(String::as_str));
     // Output is shown so that skipped tests are seen with their reasons.
@@ -113,8 +119,8 @@ fn test(filter: &[String]) -> bool {
 
 fn lint() -> bool {
     let mut clippy = vec!["clippy", "--release", "--workspace", "--all-targets"];
-    let features = ["snapsnap-python/python"].into_iter().chain(features()).collect::<Vec<_>>().join(",");
-    clippy.extend(["--features", &features]);
+    let built = built_features(features());
+    clippy.extend(["--features", &built]);
     clippy.extend(["--", "-D", "warnings"]);
     let doc = ["doc", "--release", "--workspace", "--no-deps", "--document-private-items"];
     succeeds("format", &mut cargo(&["fmt", "--all", "--check"]))

@@ -58,10 +58,11 @@ pub fn alone(name: &str, spz: &[u8]) -> String {
     let name = name.replace('&', "&amp;").replace('"', "&quot;").replace('<', "&lt;");
     let scene = BASE64_STANDARD.encode(spz);
     let scene = format!("<script id=\"scene\" type=\"text/plain\" data-name=\"{name}\">{scene}</script>");
-    let page = INDEX
+    // The script comes last: it may contain the other texts.
+    INDEX
+        .replace("</body>", &format!("{scene}</body>"))
+        .replace(STYLE, &format!("<style>{style}</style>"))
         .replace(SCRIPT, &format!("<script type=\"module\">{script}</script>"))
-        .replace(STYLE, &format!("<style>{style}</style>"));
-    page.replace("</body>", &format!("{scene}</body>"))
 }
 
 /// Serves the page of a command, `view` or `studio`, until the program ends. `shows` is its content in words; `rest`

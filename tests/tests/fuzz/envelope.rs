@@ -38,7 +38,7 @@ pub fn open(ending: &str, bytes: &[u8]) -> Option<Parts> {
             let (header, data) = rest.split_at_checked(u64::from_le_bytes(*length) as usize)?;
             parts.extend([header, data].map(|part| (Vec::new(), part.to_vec())));
         }
-        "npz" | "pth" => {
+        "npz" | "pth" | "sog" => {
             let mut archive = ZipArchive::new(Cursor::new(bytes)).ok()?;
             for row in 0..archive.len() {
                 let mut entry = archive.by_index(row).ok()?;
@@ -80,7 +80,7 @@ pub fn close(ending: &str, parts: &Parts) -> Vec<u8> {
         "safetensors" => [&(parts[0].1.len() as u64).to_le_bytes()[..], &parts[0].1, &parts[1].1].concat(),
         _ => {
             let method =
-                if ending == "pth" { CompressionMethod::Stored } else { CompressionMethod::Deflated };
+                if ending != "npz" { CompressionMethod::Stored } else { CompressionMethod::Deflated };
             let options = SimpleFileOptions::default().compression_method(method);
             let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
             for (name, part) in parts {

@@ -95,6 +95,10 @@ pub fn all() -> Vec<Format> {
         render("spz", "h.spz"),
         // With spherical harmonics, from another implementation.
         format("spz-harmonics", "v3_degree3.spz", "convert in/v3_degree3.spz out.ply"),
+        format("spz-streams", "v4_degree3.spz4", "convert in/v4_degree3.spz4 out.ply"),
+        format("sog", "cloud.sog", "convert in/cloud.sog out.ply"),
+        format("gaussians-compressed", "cloud.compressed.ply", "convert in/cloud.compressed.ply out.ply"),
+        format("splat", "h.splat", "convert in/h.splat out.ply"),
         // A mesh takes seconds, hence few cases.
         format("gaussians-mesh", "rod.ply", "mesh in/rod.ply --faces 500 --device cpu -o out.ply").cases(1),
         format("cameras", "cameras.json", "render in/h.ply --cameras in/cameras.json --device cpu -o out"),

@@ -123,6 +123,13 @@ pub fn make(folder: &Path, name: &str) {
             run(folder, &format!("convert h.ply {name}"));
         }
         "v3_degree3.spz" => copy("tests/data/spz/v3_degree3.spz", &path),
+        // The ending tells the envelope apart from a gzip stream.
+        "v4_degree3.spz4" => copy("tests/data/spz/v4_degree3.spz", &path),
+        "cloud.sog" | "cloud.compressed.ply" => copy(&format!("tests/data/foreign/{name}"), &path),
+        "h.splat" => {
+            let bytes = [0.25_f32.to_le_bytes().repeat(6), vec![200, 100, 50, 255, 255, 128, 128, 128]];
+            put(&path, bytes.concat().repeat(3));
+        }
         // Two metres high. Its mesh takes half of the time of a ball's.
         "rod.ply" => put(&path, balls((0..60_u8).map(|row| [0.0, f32::from(row) / 30.0, 0.0]), -2.5)),
         "cameras.json" => camera_file::write(&Camera::orbit(2, 24, 16), &path).expect("written"),

@@ -133,7 +133,7 @@ fn a_killed_run_leaves_no_half_subject() {
     // A subject of a run in progress is not touched.
     fs::remove_dir_all(root.join("train/img/0002")).expect("remove");
     fs::create_dir_all(root.join(".unfinished")).expect("make");
-    let lock = fs::File::create(root.join(".unfinished/train-0002.lock")).expect("create");
+    let lock = File::create(root.join(".unfinished/train-0002.lock")).expect("create");
     lock.try_lock().expect("free");
     assert_eq!(add(), Made::Elsewhere);
     drop(lock);
