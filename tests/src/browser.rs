@@ -183,6 +183,32 @@ impl Page {
         }
     }
 
+    /// Makes it a telephone's page of `width` × `height` pixels, with a touch screen.
+    pub fn become_telephone(&mut self, width: u32, height: u32) {
+        let size = json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": true });
+        self.ask("Emulation.setDeviceMetricsOverride", size);
+        self.ask("Emulation.setTouchEmulationEnabled", json!({ "enabled": true, "maxTouchPoints": 2 }));
+    }
+
+    /// An event of the touch screen (`touchStart`, `touchMove` or `touchEnd`) with the fingers at these places.
+    pub fn touch(&mut self, kind: &str, fingers: &[[f64; 2]]) {
+        let points = fingers.iter().enumerate().map(|(id, [x, y])| json!({ "x": x, "y": y, "id": id }));
+        let event = json!({ "type": kind, "touchPoints": points.collect::<Vec<_>>() });
+        self.ask("Input.dispatchTouchEvent", event);
+    }
+
+    /// Taps the element of a CSS selector.
+    pub fn tap(&mut self, selector: &str) {
+        let place = self.value(&format!(
+            "(() => {{ const e = document.querySelector({}); e.scrollIntoView({{ block: 'center' }}); \
+             const b = e.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; }})()",
+            json!(selector)
+        ));
+        let place = [0, 1].map(|i| place[i].as_f64().expect("a number"));
+        self.touch("touchStart", &[place]);
+        self.touch("touchEnd", &[]);
+    }
+
     /// Drags the left mouse button from one place of the page to another, in pixels.
     pub fn drag(&mut self, from: [f64; 2], to: [f64; 2]) {
         const STEPS: i32 = 5;

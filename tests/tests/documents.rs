@@ -112,6 +112,7 @@ fn look(words: &[String]) {
             let crates = fs::read_dir(root().join("crates")).expect("the crates");
             crates.flatten().any(|folder| folder.path().join(&file).is_file())
         }
+        ["python", "-m", "snapsnap"] => true,
         ["python", file, ..] => root().join(file).is_file(),
         ["cargo", "doc", ..] => true,
         ["pip", "install", folder] => root().join(folder).join("pyproject.toml").is_file(),

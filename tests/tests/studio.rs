@@ -362,8 +362,8 @@ mod browser {
         // Every download has the server's bytes.
         let links = page.value("[...document.querySelectorAll('#downloads a')].map((link) => link.href)");
         let links: Vec<String> = serde_json::from_value(links).expect("addresses");
-        assert_eq!(links.len(), 6);
-        for link in &links[..4] {
+        assert_eq!(links.len(), 7);
+        for link in &links[..5] {
             let size = page.value(&format!("fetch('{link}').then((a) => a.blob()).then((b) => b.size)"));
             let path = link.split_once(&server.port.to_string()).expect("an address").1;
             assert_eq!(
@@ -383,6 +383,65 @@ mod browser {
         let elsewhere =
             |address: &&String| !["blob:", "data:", own.as_str()].iter().any(|o| address.starts_with(o));
         assert_eq!(page.requests.iter().filter(elsewhere).collect::<Vec<_>>(), Vec::<&String>::new());
+    }
+
+    /// From an empty page to a download, by touch alone. One finger scrolls, two paint, and no button covers the person.
+    #[test]
+    fn a_person_is_made_on_a_telephone() {
+        let Some(mut page) = Page::new(390, 844) else { return };
+        page.become_telephone(390, 844);
+        let temporary = tempfile::tempdir().expect("temporary folder");
+        let photographs = photographs(temporary.path());
+        let server = Server::studio(SIDE);
+        open(&mut page, &server);
+        for (side, file) in ["front", "back"].into_iter().zip(&photographs) {
+            // As the telephone's own camera returns a picture.
+            page.choose(&format!("[data-side={side}] .shoot input"), file);
+            page.wait(&is_cut(side));
+        }
+        let centre = |page: &mut Page| {
+            let found = page.value(
+                "(() => { const c = document.querySelector('[data-side=front] canvas'); \
+                 c.scrollIntoView({ block: 'center' }); const b = c.getBoundingClientRect(); \
+                 return [b.x + b.width / 2, b.y + b.height / 2]; })()",
+            );
+            [0, 1].map(|i| found[i].as_f64().expect("a number"))
+        };
+        let can_undo = "!document.querySelector('[data-side=front] .undo').disabled";
+        let [x, y] = centre(&mut page);
+        let two = |step: f64| [[x - 20.0 + step, y + step], [x + 20.0 + step, y + step]];
+        page.touch("touchStart", &two(0.0));
+        (1..5).for_each(|step| page.touch("touchMove", &two(8.0 * f64::from(step))));
+        page.touch("touchEnd", &[]);
+        assert_eq!(page.value(can_undo), true, "two fingers paint");
+        page.tap("[data-side=front] .undo");
+        page.wait(&format!("!({can_undo})"));
+        let [x, y] = centre(&mut page);
+        let scrolled = "document.getElementById('studio').scrollTop";
+        let before = page.value(scrolled).as_f64().expect("a number");
+        page.touch("touchStart", &[[x, y]]);
+        (1..8).for_each(|step| page.touch("touchMove", &[[x, y - 20.0 * f64::from(step)]]));
+        page.touch("touchEnd", &[]);
+        page.wait(&format!("{scrolled} > {}", before + 50.0));
+        assert_eq!(page.value(can_undo), false, "one finger does not paint");
+
+        let before = color(&mut page, "front", [0.5, 0.4]);
+        page.tap("#swap");
+        assert_ne!(color(&mut page, "front", [0.5, 0.4]), before, "the back is the front");
+        page.tap("#swap");
+        assert_eq!(color(&mut page, "front", [0.5, 0.4]), before);
+        page.tap("#make");
+        page.wait("document.getElementById('studio').classList.contains('hidden')");
+        let covered = "(() => { const [c, n] = ['#canvas', 'nav'].map((s) => document.querySelector(s).getBoundingClientRect()); \
+                       return c.bottom > n.top && c.right > n.left; })()";
+        assert_eq!(page.value(covered), false, "upright");
+        page.become_telephone(844, 390);
+        page.wait(&format!("!{covered}"));
+        let size = page.value(
+            "fetch(document.querySelector('#downloads a').href).then((a) => a.blob()).then((b) => b.size)",
+        );
+        assert!(size.as_u64() > Some(100_000), "{size}");
+        assert!(page.errors.is_empty(), "{:?}", page.errors);
     }
 
     /// The joints are drawn faintly. Feet beyond the border are said, beside the legs.

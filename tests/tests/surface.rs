@@ -311,7 +311,7 @@ fn meshes_that_cannot_be_are_refused() {
         + "end_header\n";
     place.write("empty.ply", nothing);
     for (file, to, more, expected) in [
-        ("human.ply", "a.stl", "", "neither .glb nor .obj nor .ply"),
+        ("human.ply", "a.fbx", "", "is no .glb, .obj, .ply, .stl or .3mf"),
         ("human.ply", "a.ply", "--texture 512", "this kind has no texture"),
         ("human.ply", "no/such/folder/a.glb", "", "cannot write"),
         ("human.ply", "a.glb", "--texture 3", "64"),

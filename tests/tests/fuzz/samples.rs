@@ -247,20 +247,26 @@ fn pyramid(folder: &Path) -> Mesh {
 /// A PLY with colours, texture coordinates and an element that is skipped, before the vertices.
 fn mesh_ply(mesh: &Mesh, format: Format) -> Vec<u8> {
     let mut lists: Vec<u8> = Vec::new();
-    let mut add = |value: f64, little: &[u8]| match format {
-        Format::Ascii => lists.extend(format!("{value} ").bytes()),
-        Format::Big => lists.extend(little.iter().rev()),
-        Format::Little | Format::Double => lists.extend(little),
-    };
-    [2_u8, 0, 1].into_iter().for_each(|value| add(value.into(), &[value]));
-    for face in &mesh.faces {
-        add(3.0, &[3]);
-        face.positions.into_iter().for_each(|row| add(row.into(), &row.to_le_bytes()));
-        add(6.0, &[6]);
-        for row in face.texcoords.unwrap_or_default() {
-            let texcoord = mesh.texcoords[row as usize].to_array();
-            texcoord.into_iter().for_each(|value| add(value.into(), &value.to_le_bytes()));
+    // Each value as a number and as little-endian bytes.
+    let mut add = |row: Vec<(f64, Vec<u8>)>| {
+        for (value, little) in row {
+            match format {
+                Format::Ascii => lists.extend(format!("{value} ").bytes()),
+                Format::Big => lists.extend(little.iter().rev()),
+                Format::Little | Format::Double => lists.extend(little),
+            }
         }
+        if matches!(format, Format::Ascii) {
+            lists.push(b'\n');
+        }
+    };
+    let byte = |value: u8| (f64::from(value), vec![value]);
+    add([2, 0, 1].map(byte).into());
+    for face in &mesh.faces {
+        let positions = face.positions.into_iter().map(|row| (row.into(), row.to_le_bytes().into()));
+        let places = face.texcoords.unwrap_or_default().map(|row| mesh.texcoords[row as usize].to_array());
+        let places = places.into_iter().flatten().map(|value| (value.into(), value.to_le_bytes().into()));
+        add([byte(3)].into_iter().chain(positions).chain([byte(6)]).chain(places).collect());
     }
     let vertex = |position: &Vec3| -> Row {
         let [x, y, z] = position.to_array().map(f64::from);

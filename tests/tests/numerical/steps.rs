@@ -121,7 +121,13 @@ fn compare_weights(stage: &str, expected_rows: &Rows, after: &Networks, expected
         let norm = values(row.clone()).iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
         let size = expected.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
         if norm.sqrt() > 1e-3 * total && size > 1e-3 {
-            let error = relative_error(&got[&name], &expected);
+            // So has a single weight whose gradient is rounding alone, such as a bias of the keys.
+            let gradient = values(row.clone());
+            let least = 1e-4 * gradient.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+            let moved = |of: &[f32]| -> Vec<f32> {
+                of.iter().zip(&gradient).filter(|(_, g)| g.abs() > least).map(|(v, _)| *v).collect()
+            };
+            let error = relative_error(&moved(&got[&name]), &moved(&expected));
             assert!(error <= 1e-4, "{stage}: {name} after a step: {error:e}");
         }
     }
