@@ -94,9 +94,10 @@ const HAIR: f32 = 1.6;
 const FACE: f32 = 1.2;
 /// Distance beyond the border from which a part is outside of the picture, as a share of the torso's length.
 const BEYOND: f32 = 0.02;
-/// Limbs: joints that tell where a limb is, and their largest distances between front and mirrored back, as shares of the
+/// Joints that tell where a limb is, and their largest distances between front and mirrored back, as shares of the
 /// torso's length (perspective moves feet); and joints at the limb's end.
-const LIMBS: [(Part, [(usize, f32); 2], [usize; 2]); 4] = [
+type Limb = (Part, [(usize, f32); 2], [usize; 2]);
+const LIMBS: [Limb; 4] = [
     (Part::LeftArm, [(13, 0.5), (15, 0.7)], [15, 19]),
     (Part::RightArm, [(14, 0.5), (16, 0.7)], [16, 20]),
     (Part::LeftLeg, [(25, 0.6), (27, 1.0)], [29, 31]),

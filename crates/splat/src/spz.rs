@@ -80,12 +80,15 @@ fn word(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"))
 }
 
+/// Reads the next bytes, of columns with this name.
+type Take<'a> = dyn FnMut(usize, &str) -> Result<Vec<u8>, Problem> + 'a;
+
 /// The Gaussians of a file with this header and a version among `versions`. `take` returns the next columns' bytes.
 fn columns(
     header: &[u8],
     versions: RangeInclusive<u32>,
     length: u64,
-    take: &mut dyn FnMut(usize, &str) -> Result<Vec<u8>, Problem>,
+    take: &mut Take,
 ) -> Result<Stored, Problem> {
     let word = |at: usize| word(header, at);
     if word(0) != MAGIC {

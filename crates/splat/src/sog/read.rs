@@ -84,8 +84,8 @@ pub(crate) fn read(mut input: impl Read, length: u64) -> Result<Stored, Problem>
         let labels = of_each("shN", 1)?;
         let centroids = picture("shN", 0)?;
         for channel in 0..3 {
-            for band in 1..coefficients {
-                let sign = if REVERSED[band] { -1.0 } else { 1.0 };
+            for (band, is_reversed) in REVERSED.iter().enumerate().take(coefficients).skip(1) {
+                let sign = if *is_reversed { -1.0 } else { 1.0 };
                 let value = |pixel: &image::Rgba<u8>| {
                     let label = u32::from(u16::from_le_bytes([pixel[0], pixel[1]]));
                     let column = label % ENTRIES * (coefficients as u32 - 1) + band as u32 - 1;
