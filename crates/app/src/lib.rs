@@ -40,7 +40,7 @@ pub use failure::Failure;
 pub use model::{CameraArguments, ModelArguments, check_memory};
 
 /// The program's version, with commit and date where the sources were in a repository.
-pub const VERSION: &str = env!("SNAPSNAP_VERSION");
+const VERSION: &str = env!("SNAPSNAP_VERSION");
 
 /// Every operation allocates and frees large tensors. mimalloc keeps their pages, while the system allocator returns
 /// them to the kernel and causes page faults.

@@ -28,7 +28,7 @@ mod _native {
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         snapsnap::set_up();
-        module.add("__version__", snapsnap::VERSION)
+        module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 
     /// Runs the command line. `program` starts this package as a program.
