@@ -174,6 +174,9 @@ fn damaged_files_of_others_are_refused_by_name() {
     };
     refused("cut.ply", &packed[..packed.len() - 1], "is missing; the file may be cut off");
     refused("chunks.ply", &text("element chunk 1\n", "element chunk 0\n"), "0 chunks for 24 Gaussians");
+    // Rows without bytes would be read for ever.
+    let endless = text("element sh 24\n", "element sh 99999999999999\nelement other 24\n");
+    refused("endless.ply", &endless, "`sh` has no properties");
     refused("name.ply", &text("packed_scale", "packed_scare"), "without `packed_scale`");
 }
 

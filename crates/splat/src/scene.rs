@@ -95,8 +95,10 @@ impl Stored {
     /// # Errors
     /// As [`Self::write`].
     pub fn write_y_down(&self, path: &Path) -> Result<(), SplatError> {
-        let bytes = self.to_bytes_y_down()?;
-        Ok(file::write_whole(path, |out| out.write_all(&bytes)).map_err(FileError::write(path))?)
+        self.check(Kind::Ply, path)?;
+        let turned = self.with_y_down();
+        let written = file::write_whole(path, |out| ply::write(&turned, Some(ply::Y_DOWN), out));
+        Ok(written.map_err(FileError::write(path))?)
     }
 
     /// The bytes of [`Self::write_y_down`]'s file.
@@ -106,11 +108,15 @@ impl Stored {
     pub fn to_bytes_y_down(&self) -> Result<Vec<u8>, SplatError> {
         let path = Path::new("memory");
         self.check(Kind::Ply, path)?;
+        let mut bytes = Vec::new();
+        ply::write(&self.with_y_down(), Some(ply::Y_DOWN), &mut bytes).map_err(FileError::write(path))?;
+        Ok(bytes)
+    }
+
+    fn with_y_down(&self) -> Self {
         let mut turned = self.clone();
         turned.turn(false);
-        let mut bytes = Vec::new();
-        ply::write(&turned, Some(ply::Y_DOWN), &mut bytes).map_err(FileError::write(path))?;
-        Ok(bytes)
+        turned
     }
 
     /// The bytes of a file of this kind.

@@ -23,21 +23,23 @@ pub(super) fn is_compressed(header: &Header) -> bool {
     header.elements.iter().any(|element| element.name == "vertex" && is_packed(element))
 }
 
-/// The rows of an element, whose values must be single.
-fn rows(body: &mut Body<impl BufRead>, element: &Element) -> Result<Vec<Vec<f64>>, Problem> {
+/// The values of an element, row after row. They must be single.
+fn values(body: &mut Body<impl BufRead>, element: &Element) -> Result<Vec<f64>, Problem> {
     if let Some(list) = element.properties.iter().find(|p| p.list.is_some()) {
         return Err(format!("`{}` has a list, `{}`", element.name, snapsnap_base::quoted(&list.name)).into());
     }
-    let mut rows = Vec::new();
+    // Without properties, the file need not contain the rows that the header promises.
+    if element.properties.is_empty() {
+        return Err(format!("`{}` has no properties", element.name).into());
+    }
+    let mut values = Vec::new();
     for row in 0..element.count {
-        let mut values = Vec::with_capacity(element.properties.len());
         body.row(element, row, 1, |_, value| {
             values.push(value.exact()?);
             Some(())
         })?;
-        rows.push(values);
     }
-    Ok(rows)
+    Ok(values)
 }
 
 /// Reads the Gaussians of a header for which [`is_compressed`] holds.
@@ -53,12 +55,12 @@ pub(super) fn read(header: &Header, mut body: Body<impl BufRead>) -> Result<Stor
                 continue;
             }
         };
-        *found = Some((element, rows(&mut body, element)?));
+        *found = Some((element, values(&mut body, element)?));
     }
     let (chunk, chunks) = chunks.ok_or_else(|| "a compressed PLY without its element `chunk`".to_owned())?;
-    let (vertex, vertices) = vertices.unwrap_or((chunk, Vec::new()));
-    if chunks.len() < vertices.len().div_ceil(CHUNK) {
-        return Err(format!("{} chunks for {} Gaussians", chunks.len(), vertices.len()).into());
+    let (vertex, vertices) = vertices.expect("a compressed PLY has packed vertices");
+    if chunk.count < vertex.count.div_ceil(CHUNK) {
+        return Err(format!("{} chunks for {} Gaussians", chunk.count, vertex.count).into());
     }
     let place = |element: &Element, name: &str| element.properties.iter().position(|p| p.name == name);
     let lacks = |name: &str| Problem::from(format!("a compressed PLY without `{name}`"));
@@ -79,13 +81,14 @@ pub(super) fn read(header: &Header, mut body: Body<impl BufRead>) -> Result<Stor
     // A share of the range of a chunk.
     let ranged = |i: usize, which: usize, share: f32| match ranges[which] {
         Some([low, high]) => {
-            let [low, high] = [low, high].map(|limit| chunks[i / CHUNK][limit] as f32);
+            let own = &chunks[i / CHUNK * chunk.properties.len()..];
+            let [low, high] = [low, high].map(|limit| own[limit] as f32);
             low + share * (high - low)
         }
         None => share,
     };
-    let mut columns = vec![Vec::with_capacity(vertices.len()); Stored::COLUMNS.len()];
-    for (i, row) in vertices.iter().enumerate() {
+    let mut columns = vec![Vec::with_capacity(vertex.count); Stored::COLUMNS.len()];
+    for (i, row) in vertices.chunks_exact(vertex.properties.len()).enumerate() {
         let centre = eleven_ten_eleven(word(row, 0));
         let scale = eleven_ten_eleven(word(row, 2));
         let color = word(row, 3).to_be_bytes().map(|byte| f32::from(byte) / 255.0);
@@ -97,19 +100,21 @@ pub(super) fn read(header: &Header, mut body: Body<impl BufRead>) -> Result<Stor
         columns.iter_mut().zip(all).for_each(|(column, value)| column.push(value));
     }
     let mut coefficients = 1;
-    if let Some((element, rows)) = harmonics {
+    if let Some((element, bytes)) = harmonics {
         let count = element.properties.len();
         let known = COEFFICIENTS.into_iter().find(|known| 3 * (known - 1) == count);
-        let there = known.filter(|_| rows.len() == vertices.len());
+        let there = known.filter(|_| element.count == vertex.count);
         coefficients = there.ok_or_else(|| {
-            format!("`sh` has {count} values for {} of {} Gaussians", rows.len(), vertices.len())
+            format!("`sh` has {count} values for {} of {} Gaussians", element.count, vertex.count)
         })?;
         let value = |byte: f64| match byte {
             0.0 => -0.5 * HARMONICS,
             255.0 => 0.5 * HARMONICS,
             byte => ((byte as f32 + 0.5) / 256.0 - 0.5) * HARMONICS,
         };
-        columns.extend((0..count).map(|band| rows.iter().map(|row| value(row[band])).collect()));
+        columns.extend(
+            (0..count).map(|band| bytes.iter().skip(band).step_by(count).map(|b| value(*b)).collect()),
+        );
     }
     Ok(Stored { coefficients, columns })
 }

@@ -14,6 +14,8 @@ use crate::stored::{COEFFICIENTS, Problem, Stored, check_ratio, logit};
 const MAX_META: u64 = 1 << 20;
 /// Palette entries of SH in one row of their picture.
 const ENTRIES: u32 = 64;
+/// Pixels of the largest palette: 65,536 entries of 15 coefficients.
+const LARGEST_PALETTE: u64 = 15 << 16;
 /// Bytes of a Gaussian in memory: its columns, and its pixels of five pictures.
 const BYTES: u64 = 14 * 4 + 5 * 4;
 /// For each SH basis function, whether a turn by 180° about z negates it.
@@ -33,10 +35,12 @@ pub(crate) fn read(mut input: impl Read, length: u64) -> Result<Stored, Problem>
     let count = meta["count"].as_u64().filter(|count| (1..=(MAX_SIDE * MAX_SIDE) as u64).contains(count));
     let count = count.ok_or_else(|| "meta.json: `count` is no number of Gaussians".to_owned())? as usize;
     check_ratio(count, count as u64 * BYTES, length)?;
+    // A picture may have a rim, and a palette its own size.
+    let most = (4 * count as u64).max(LARGEST_PALETTE);
     let mut picture = |part: &str, i: usize| {
         let name = meta[part]["files"][i].as_str();
         let name = name.ok_or_else(|| format!("meta.json: `{part}.files` lacks a name"))?;
-        pixels(&entry(&mut archive, name, length.saturating_mul(2))?, name)
+        pixels(&entry(&mut archive, name, length.saturating_mul(2))?, name, most)
     };
     let mut of_each = |part: &str, i: usize| {
         let picture = picture(part, i)?;
@@ -112,12 +116,14 @@ fn entry(archive: &mut ZipArchive<impl Read + Seek>, name: &str, most: u64) -> R
     Ok(bytes)
 }
 
-/// The pixels of a WebP picture.
-fn pixels(bytes: &[u8], name: &str) -> Result<RgbaImage, Problem> {
+/// The pixels of a WebP picture of at most `most` pixels.
+fn pixels(bytes: &[u8], name: &str, most: u64) -> Result<RgbaImage, Problem> {
     let damaged = |e: image::ImageError| format!("{name}: {e}");
     let decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(damaged)?;
-    check_ratio(0, 4 * decoder.total_bytes() / 4, bytes.len() as u64)
-        .map_err(|_| format!("{name}: is far larger than its bytes"))?;
+    let (width, height) = decoder.dimensions();
+    if u64::from(width) * u64::from(height) > most {
+        return Err(format!("{name}: {width}×{height} pixels are too many for its Gaussians").into());
+    }
     Ok(DynamicImage::from_decoder(decoder).map_err(damaged)?.into_rgba8())
 }
 
