@@ -5,9 +5,10 @@ use std::panic;
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
-use burn::tensor::{Device, DeviceKind, DeviceType};
+#[cfg(feature = "gpu")]
+use burn::tensor::DeviceKind;
+use burn::tensor::{Device, DeviceType};
 use serde::{Deserialize, Serialize};
-use snapsnap_splat::graphics_api;
 
 use crate::failure::Failure;
 use crate::memory;
@@ -34,11 +35,15 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
             return Ok(card.unwrap_or_else(Device::flex));
         }
         "cpu" | "flex" => return Ok(Device::flex()),
+        #[cfg(feature = "gpu")]
         "ndarray" => return Ok(ndarray()),
         _ => {}
     }
     match gpus().into_iter().find(|(compiled, ..)| *compiled == kind) {
         Some((.., kind)) => nth(name, kind, index),
+        None if ["wgpu", "ndarray"].contains(&kind) => {
+            Err(unknown(name, "not compiled in: build with --features gpu"))
+        }
         None if ["vulkan", "cuda", "metal"].contains(&kind) => {
             Err(unknown(name, &format!("not compiled in: build with --features {kind}")))
         }
@@ -76,7 +81,9 @@ pub fn choose_in_turn(name: &str, turn: usize) -> Result<Device, Failure> {
 /// Both CPU backends, and of every compiled kind the first card, or else a software adapter that can run kernels.
 pub fn all() -> Vec<Device> {
     let gpus = gpus().into_iter().filter_map(|(name, ..)| choose(name).ok());
-    [Device::flex(), ndarray()].into_iter().chain(gpus).collect()
+    #[cfg(feature = "gpu")]
+    let gpus = [ndarray()].into_iter().chain(gpus);
+    [Device::flex()].into_iter().chain(gpus).collect()
 }
 
 /// A working device.
@@ -102,12 +109,19 @@ impl Adapter {
     }
 }
 
+/// Names and backends of the devices of the processor.
+const PROCESSORS: &[(&str, &str)] = &[
+    ("cpu", "Burn's flex"),
+    #[cfg(feature = "gpu")]
+    ("ndarray", "Burn's ndarray"),
+];
+
 /// The devices of the processor, one of each backend.
-pub fn processors() -> [Adapter; 2] {
-    [("cpu", "Burn's flex"), ("ndarray", "Burn's ndarray")].map(|(name, backend)| Adapter {
-        name: name.into(),
+pub fn processors() -> impl Iterator<Item = Adapter> {
+    PROCESSORS.iter().map(|(name, backend)| Adapter {
+        name: (*name).into(),
         adapter: processor(),
-        backend: backend.into(),
+        backend: (*backend).into(),
         software: false,
         memory: Some(memory::there()),
     })
@@ -125,7 +139,7 @@ pub fn probe() -> String {
     let of_kind = |(kind, backend, device_type): (&str, &str, DeviceType)| {
         let adapter = |(index, device): (usize, Device)| Adapter {
             name: format!("{kind}:{index}"),
-            adapter: device.identity().map_or_else(|| "?".into(), |identity| identity.name),
+            adapter: identity(&device).map_or_else(|| "?".into(), |(name, _)| name),
             backend: backend.into(),
             software: !is_card(&device),
             // The graphics layer has no function for the memory of cards.
@@ -133,7 +147,7 @@ pub fn probe() -> String {
         };
         devices(device_type).into_iter().enumerate().map(adapter).collect::<Vec<_>>()
     };
-    let drivers: Drivers = (gpus().into_iter().flat_map(of_kind).collect(), graphics_api::is_opengl());
+    let drivers: Drivers = (gpus().into_iter().flat_map(of_kind).collect(), graphics_has_only_opengl());
     serde_json::to_string(&drivers).expect("plain text and numbers")
 }
 
@@ -173,7 +187,7 @@ pub fn is_opengl() -> bool {
 
 /// Kinds of devices of this build.
 pub fn compiled_in() -> Vec<&'static str> {
-    ["cpu", "ndarray"].into_iter().chain(gpus().into_iter().map(|(name, ..)| name)).collect()
+    PROCESSORS.iter().map(|(name, _)| *name).chain(gpus().into_iter().map(|(name, ..)| name)).collect()
 }
 
 fn processor() -> String {
@@ -181,6 +195,14 @@ fn processor() -> String {
     system.refresh_cpu_list(sysinfo::CpuRefreshKind::nothing());
     let brand = system.cpus().first().map(|cpu| cpu.brand().trim().to_owned());
     brand.filter(|brand| !brand.is_empty()).unwrap_or_else(|| "this processor".into())
+}
+
+/// Whether wgpu would use OpenGL.
+fn graphics_has_only_opengl() -> bool {
+    #[cfg(feature = "gpu")]
+    return snapsnap_splat::graphics_api::is_opengl();
+    #[cfg(not(feature = "gpu"))]
+    false
 }
 
 /// Kinds of GPU devices that are compiled in, best first, each with its backend.
@@ -192,19 +214,30 @@ fn gpus() -> Vec<(&'static str, &'static str, DeviceType)> {
         ("metal", "wgpu, MSL", DeviceType::Metal),
         #[cfg(feature = "vulkan")]
         ("vulkan", "wgpu, SPIR-V", DeviceType::Vulkan),
+        #[cfg(feature = "gpu")]
         ("wgpu", "wgpu, WGSL", DeviceType::Wgpu),
     ]
 }
 
 /// A device in words.
 pub fn describe(device: &Device) -> String {
-    let Some(identity) = device.identity() else {
+    let Some((name, is_card)) = identity(device) else {
         return if *device == Device::flex() { "cpu (flex)".into() } else { "cpu (ndarray)".into() };
     };
-    let software = if identity.physical.is_none() { ", software" } else { "" };
-    format!("{}{software}", identity.name)
+    let software = if is_card { "" } else { ", software" };
+    format!("{name}{software}")
 }
 
+/// Name of a GPU, and whether it is a card; `None` for the processor.
+fn identity(device: &Device) -> Option<(String, bool)> {
+    #[cfg(feature = "gpu")]
+    let identity = device.identity().map(|identity| (identity.name, identity.physical.is_some()));
+    #[cfg(not(feature = "gpu"))]
+    let identity = (*device != Device::flex()).then(|| (String::new(), true));
+    identity
+}
+
+#[cfg(feature = "gpu")]
 #[allow(deprecated, reason = "kept as the second CPU implementation")]
 fn ndarray() -> Device {
     Device::ndarray()
@@ -212,10 +245,13 @@ fn ndarray() -> Device {
 
 /// The devices of a kind. Without a driver the graphics layer panics, and there are none.
 fn devices(kind: DeviceType) -> Vec<Device> {
+    #[cfg(feature = "gpu")]
     let is_wgpu = matches!(kind, DeviceType::Wgpu);
+    #[cfg(not(feature = "gpu"))]
+    let is_wgpu = false;
     let hook = panic::take_hook();
     panic::set_hook(Box::new(|_| {}));
-    let found = panic::catch_unwind(|| match is_wgpu && graphics_api::is_opengl() {
+    let found = panic::catch_unwind(|| match is_wgpu && graphics_has_only_opengl() {
         true => Vec::new(),
         false => Device::enumerate(kind).into_vec(),
     });
@@ -235,6 +271,7 @@ fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Fai
     }
     let device = match index {
         // The runtime chooses the fastest card.
+        #[cfg(feature = "gpu")]
         None if name == "wgpu" => return Ok(Device::wgpu(DeviceKind::DefaultDevice)),
         None => devices.iter().find(|device| is_card(device)).or(devices.first()),
         Some(index) => devices.get(index),
@@ -249,11 +286,12 @@ fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Fai
 }
 
 fn is_card(device: &Device) -> bool {
-    device.identity().is_some_and(|identity| identity.physical.is_some())
+    identity(device).is_some_and(|(_, is_card)| is_card)
 }
 
 fn unknown(name: &str, why: &str) -> Failure {
-    let mut there = vec!["auto".to_owned(), "cpu (= flex)".into(), "ndarray".into()];
+    let mut there = vec!["auto".to_owned(), "cpu (= flex)".into()];
+    there.extend(PROCESSORS[1..].iter().map(|(name, _)| (*name).to_owned()));
     there.extend(adapters().iter().map(|adapter| {
         let software = if adapter.software { ", software" } else { "" };
         format!("{} ({}{software})", adapter.name, adapter.adapter)

@@ -54,7 +54,7 @@ impl Download {
             Self::YDown => Ok(stored.to_bytes_y_down()?),
             Self::Mesh => {
                 let fused = fuse(&stored.load(&Device::flex()), mesh::options(MeshKind::Glb), step)?;
-                export::glb_bytes(&fused.mesh).map_err(|e| Failure::Internal(e.to_string()))
+                export::glb_bytes(&fused.mesh, None).map_err(|e| Failure::Internal(e.to_string()))
             }
             Self::Turntable => {
                 let counted = |done, all| step(&format!("{done} of {all} pictures"));

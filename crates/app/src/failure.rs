@@ -9,6 +9,7 @@ use snapsnap_base::config::ConfigError;
 use snapsnap_eval::EvalError;
 use snapsnap_mesh::fuse::FuseError;
 use snapsnap_net::weights::WeightsError;
+use snapsnap_rig::RigError;
 use snapsnap_splat::SplatError;
 use snapsnap_train::TrainError;
 
@@ -106,6 +107,16 @@ impl From<FuseError> for Failure {
             FuseError::Splat(e) => e.into(),
             FuseError::Reduce(_) => Self::Internal(e.to_string()),
             FuseError::Long(_) => Self::Input(format!("{e}; add --force to make it anyway")),
+            _ => Self::Input(e.to_string()),
+        }
+    }
+}
+
+impl From<RigError> for Failure {
+    fn from(e: RigError) -> Self {
+        match e {
+            RigError::Fuse(e) => e.into(),
+            RigError::Splat(e) => e.into(),
             _ => Self::Input(e.to_string()),
         }
     }

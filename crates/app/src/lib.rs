@@ -117,6 +117,9 @@ enum Command {
     /// Make one closed surface of Gaussians: a mesh for modelling programs and game engines.
     #[command(after_help = "Example: snapsnap mesh human.ply -o human.glb")]
     Mesh(commands::mesh::Arguments),
+    /// Give a person a skeleton: a mesh that moves, or the person in another pose.
+    #[command(after_help = "Example: snapsnap rig human.ply -o human.glb --motion walk.bvh")]
+    Rig(commands::rig::Arguments),
     /// Turn a file of Gaussians into another kind: PLY, SPZ, which is an eighth as large, GLB or SOG.
     #[command(after_help = "Example: snapsnap convert human.ply human.spz")]
     Convert(commands::convert::Arguments),
@@ -230,6 +233,7 @@ pub fn main(program: &[OsString], arguments: Vec<OsString>) -> u8 {
         Command::Studio(arguments) => commands::studio::run(&arguments),
         Command::View(arguments) => commands::view::run(&arguments),
         Command::Mesh(arguments) => commands::mesh::run(&arguments),
+        Command::Rig(arguments) => commands::rig::run(&arguments),
         Command::Convert(arguments) => commands::convert::run(&arguments),
         Command::Prepare(arguments) => commands::prepare::run(&arguments),
         Command::TrainStage1(arguments) => return ended_with(commands::train::stage1(&arguments)),

@@ -4,6 +4,7 @@ use std::fs;
 
 use burn::tensor::Device;
 use snapsnap_net::weights::WeightFile;
+pub use snapsnap_ops::is_cpu;
 use sysinfo::{MemoryRefreshKind, RefreshKind, System};
 
 use crate::failure::{Failure, bail};
@@ -17,11 +18,6 @@ pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
     }
     let [needed, there] = [needed, there].map(|bytes| bytes as f64 / 1e9);
     bail!("{what} needs {needed:.1} GB of memory, but this process can have only {there:.1} GB: {mend}")
-}
-
-/// Whether the device is the CPU, which uses the machine's memory.
-pub fn is_cpu(device: &Device) -> bool {
-    device.identity().is_none()
 }
 
 /// Refuses networks that need more memory on the CPU than this process can have.

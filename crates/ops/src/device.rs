@@ -8,10 +8,19 @@ pub fn has_kernels<const D: usize>(x: &Tensor<D>) -> bool {
     x.dtype() == DType::F32 && x.device().inner() == Device::flex()
 }
 
+/// Whether the device is the CPU, which uses the machine's memory. Without the feature `gpu` there is no other one.
+pub fn is_cpu(device: &Device) -> bool {
+    #[cfg(feature = "gpu")]
+    let is_cpu = device.clone().inner().identity().is_none();
+    #[cfg(not(feature = "gpu"))]
+    let is_cpu = device.clone().inner() == Device::flex();
+    is_cpu
+}
+
 /// Whether `x` is on a GPU and has gradients.
 pub fn is_tracked_on_gpu<const D: usize>(x: &Tensor<D>) -> bool {
     let device = x.device();
-    device.is_autodiff() && device.inner().identity().is_some()
+    device.is_autodiff() && !is_cpu(&device)
 }
 
 /// `x` in the float type of a layer's weight; on `flex` `x` itself, because kernels round their factors themselves.

@@ -10,13 +10,13 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Dispatch, Flex, TensorMetadata, backend_extension};
 use burn::tensor::{Int, Shape, Tensor, TensorData};
-use burn_cubecl::CubeBackend;
 
 use crate::device::is_tracked_on_gpu;
 use crate::op::One;
 
 /// Backends with the operation.
-#[backend_extension(Cube, Flex, Autodiff)]
+#[cfg_attr(feature = "gpu", backend_extension(Cube, Flex, Autodiff))]
+#[cfg_attr(not(feature = "gpu"), backend_extension(Flex, Autodiff))]
 pub trait RowsBackend: Backend {
     /// The `rows` `[M, C]` of a table `[N, C]`.
     fn take(#[extension_type] table: One<Self>, rows: Arc<[i32]>) -> One<Self> {
@@ -24,7 +24,8 @@ pub trait RowsBackend: Backend {
     }
 }
 
-impl RowsBackend for CubeBackend {}
+#[cfg(feature = "gpu")]
+impl RowsBackend for burn_cubecl::CubeBackend {}
 impl RowsBackend for Flex {}
 
 fn select<B: Backend>(table: FloatTensor<B>, rows: &[i32]) -> FloatTensor<B> {

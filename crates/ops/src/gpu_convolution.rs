@@ -11,7 +11,6 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, Dispatch, ExtensionType, Flex, TensorMetadata, backend_extension};
 use burn::tensor::ops::ConvOptions;
 use burn::tensor::{DType, FloatDType, Shape, Slice, Tensor};
-use burn_cubecl::CubeBackend;
 
 use crate::op::One;
 
@@ -28,7 +27,8 @@ pub struct Operands<B: Backend> {
 }
 
 /// Backends with the operation.
-#[backend_extension(Cube, Flex, Autodiff)]
+#[cfg_attr(feature = "gpu", backend_extension(Cube, Flex, Autodiff))]
+#[cfg_attr(not(feature = "gpu"), backend_extension(Flex, Autodiff))]
 pub trait ConvolutionBackend: Backend {
     /// A convolution with zero padding of half a kernel: an image `[B, D, ⌈H / stride⌉, ⌈W / stride⌉]`.
     fn convolve(#[extension_type] operands: Operands<Self>, stride: usize) -> One<Self> {
@@ -36,7 +36,8 @@ pub trait ConvolutionBackend: Backend {
     }
 }
 
-impl ConvolutionBackend for CubeBackend {}
+#[cfg(feature = "gpu")]
+impl ConvolutionBackend for burn_cubecl::CubeBackend {}
 impl ConvolutionBackend for Flex {}
 
 #[derive(Debug)]

@@ -29,7 +29,7 @@ mod tests;
 use burn::tensor::Tensor;
 
 pub use buffers::release_buffers;
-pub use device::{as_weight, has_kernels, host, is_bf16};
+pub use device::{as_weight, has_kernels, host, is_bf16, is_cpu};
 pub use layers::linear_gelu;
 pub use mean_lengths::mean_lengths;
 pub use resize::bilinear;

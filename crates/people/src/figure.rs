@@ -24,6 +24,22 @@ pub struct Build {
     pub head: f32,
 }
 
+impl Default for Build {
+    /// A body of average proportions.
+    fn default() -> Self {
+        Self {
+            stature: 1.7,
+            sex: 0.5,
+            girth: 1.0,
+            belly: 0.0,
+            legs: 1.0,
+            arms: 1.0,
+            shoulders: 1.0,
+            head: 1.08,
+        }
+    }
+}
+
 impl Build {
     pub fn draw(random: &mut impl Rng) -> Self {
         let sex: f32 = random.random_range(0.0..1.0);
@@ -96,6 +112,12 @@ const ARMS: [(f32, [(f32, f32); 4]); 12] = [
 ];
 
 impl Pose {
+    /// Somebody who stands straight, with the arms raised aside by these degrees: 90 for a T, 45 for an A.
+    pub fn standing(arms: f32) -> Self {
+        Self { arms: [[arms, 0.0, 0.0, 0.0]; 2], legs: [[0.0, 3.0, 0.0]; 2], ..Self::default() }
+    }
+
+    /// A random pose of somebody who stands or walks.
     pub fn draw(random: &mut impl Rng) -> Self {
         let mut between = |low: f32, high: f32| random.random_range(low..high);
         // Hips before (negative) or behind the ankles, up to 10 cm. The trunk leans to the other side.

@@ -10,6 +10,9 @@ pub mod poses;
 mod skeleton;
 pub mod synth;
 
+pub use figure::Pose;
+pub use skeleton::Placed;
+
 /// How finely people are meshed and painted, by the size of their pictures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Detail {

@@ -5,6 +5,7 @@ use std::path::Path;
 use glam::{Mat3, Vec3};
 use rand::Rng;
 use snapsnap_base::{FileError, file, folder, quoted};
+use snapsnap_mesh::import::Bone;
 
 use crate::figure::{Pose, sign};
 use crate::math::{rotate_x, rotate_y, rotate_z};
@@ -38,7 +39,7 @@ impl Poses {
     pub fn open(folder: &Path) -> Result<Option<Self>, FileError> {
         let mut poses = Vec::new();
         for path in folder::with_ending(folder, "bvh")? {
-            poses.extend(read(&path)?.into_iter().filter(Pose::stands));
+            poses.extend(read(&path)?.poses.into_iter().filter(Pose::stands));
         }
         Ok((!poses.is_empty()).then_some(Self { poses }))
     }
@@ -66,6 +67,15 @@ impl Poses {
     }
 }
 
+/// The frames of a motion file.
+#[derive(Debug, Clone)]
+pub struct Motion {
+    /// By frame. There may be none.
+    pub poses: Vec<Pose>,
+    /// Time between two frames, seconds.
+    pub step: f32,
+}
+
 /// A joint: its parent's index, its offset from the parent, and its channels.
 struct Joint {
     name: String,
@@ -87,16 +97,16 @@ fn channel(word: &str) -> Option<Channel> {
     }
 }
 
-/// The poses of a motion file.
+/// The motion of a file (BVH) with the joint names of Mixamo or MakeHuman.
 ///
 /// # Errors
 /// [`FileError`] naming the file and what is wrong.
-pub fn read(path: &Path) -> Result<Vec<Pose>, FileError> {
+pub fn read(path: &Path) -> Result<Motion, FileError> {
     let text = file::read_text(path, MAX_BYTES).map_err(FileError::read(path))?;
     parse(&text).map_err(|problem| FileError::unsuitable(path, problem))
 }
 
-fn parse(text: &str) -> Result<Vec<Pose>, String> {
+fn parse(text: &str) -> Result<Motion, String> {
     let mut words = text.split_ascii_whitespace();
     let expect = |found: Option<&str>, wanted: &str| match found {
         Some(word) if word.eq_ignore_ascii_case(wanted) => Ok(()),
@@ -150,8 +160,8 @@ fn parse(text: &str) -> Result<Vec<Pose>, String> {
     let frames: usize = words.next().and_then(|word| word.parse().ok()).ok_or("has no number of frames")?;
     expect(words.next(), "Frame")?;
     expect(words.next(), "Time:")?;
-    number(words.next())?;
-    let skeleton = Rows::find(&joints)?;
+    let step = number(words.next())?;
+    let skeleton = Rows::find(joints.iter().map(|joint| &*joint.name))?;
     let mut poses = Vec::new();
     for _ in 0..frames.min(MAX_FRAMES) {
         let mut turns: Vec<Mat3> = Vec::with_capacity(joints.len());
@@ -173,7 +183,16 @@ fn parse(text: &str) -> Result<Vec<Pose>, String> {
         }
         poses.push(skeleton.pose(&places));
     }
-    Ok(poses)
+    Ok(Motion { poses, step })
+}
+
+/// The pose of a character with the joint names of Mixamo or MakeHuman.
+///
+/// # Errors
+/// A sentence that names a missing joint.
+pub fn of_bones(bones: &[Bone]) -> Result<Pose, String> {
+    let places: Vec<Vec3> = bones.iter().map(|bone| bone.place).collect();
+    Ok(Rows::find(bones.iter().map(|bone| &*bone.name))?.pose(&places))
 }
 
 fn number(word: Option<&str>) -> Result<f32, String> {
@@ -192,8 +211,8 @@ struct Rows {
 }
 
 impl Rows {
-    fn find(joints: &[Joint]) -> Result<Self, String> {
-        let known: Vec<Option<(Name, usize)>> = joints.iter().map(|joint| known(&joint.name)).collect();
+    fn find<'a>(names: impl Iterator<Item = &'a str>) -> Result<Self, String> {
+        let known: Vec<Option<(Name, usize)>> = names.map(known).collect();
         let limb = |names: [Name; 3], side: usize| -> Result<[usize; 3], String> {
             let [first, second, third] = names.map(|name| need(&known, name, side));
             Ok([first?, second?, third?])
@@ -326,7 +345,7 @@ mod tests {
             // Files tell the trunk's ends alone.
             pose.spine = [0.0; 3];
             let figure = Figure::new(build.clone(), &pose);
-            let found = parse(&bvh(&figure)).expect("reads").remove(0);
+            let found = parse(&bvh(&figure)).expect("reads").poses.remove(0);
             let again = Figure::new(build.clone(), &found);
             let turned = |a: Vec3, b: Vec3| a.angle_between(b).to_degrees();
             let ways = |figure: &Figure| {
@@ -348,7 +367,7 @@ mod tests {
     fn damaged_motion_files_are_refused() {
         let figure = Figure::new(Build::draw(&mut stream("a")), &Pose::default());
         let sound = bvh(&figure);
-        assert_eq!(parse(&sound).expect("reads").len(), 1);
+        assert_eq!(parse(&sound).expect("reads").poses.len(), 1);
         for (from, to, expected) in [
             ("HIERARCHY", "HIER", "instead of HIERARCHY"),
             ("Frames: 1", "Frames: 2", "ends within its numbers"),

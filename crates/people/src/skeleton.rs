@@ -1,6 +1,6 @@
 //! Names of joints in files, bones of any rig and their transforms in a pose, and hands that sink into the body.
 
-use glam::{Mat3, Vec3};
+use glam::{Affine3A, Mat3, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 use crate::figure::{Bone as Limb, Figure, Pose, sign};
@@ -152,10 +152,16 @@ pub struct Placed {
     matrix: Mat3,
     /// Start of the bone at rest and in the pose.
     rest: Vec3,
-    head: Vec3,
+    /// Start of the bone in the pose.
+    pub head: Vec3,
 }
 
 impl Placed {
+    /// The transform of a resting point that follows this bone alone.
+    pub fn transform(&self) -> Affine3A {
+        Affine3A::from_mat3_translation(self.matrix, self.head - self.matrix * self.rest)
+    }
+
     /// Moves a resting point with this bone alone.
     pub fn apply(&self, p: Vec3) -> Vec3 {
         self.matrix * (p - self.rest) + self.head

@@ -18,7 +18,7 @@ mod report;
 mod resize;
 mod restoration;
 mod rim;
-mod segmenter;
+pub mod segmenter;
 mod source;
 mod specks;
 mod surface;

@@ -4,7 +4,8 @@
 use std::sync::{Mutex, OnceLock, PoisonError};
 
 use burn::tensor::Device;
-use snapsnap_net::blazepose::{BlazePose, Pose};
+use snapsnap_net::blazepose::BlazePose;
+pub use snapsnap_net::blazepose::{Pose, SIDE};
 use snapsnap_net::u2net::U2Net;
 use snapsnap_net::weights::{Source, WeightsError};
 

@@ -5,6 +5,7 @@ pub mod camera_file;
 mod error;
 mod gaussians;
 mod glb;
+#[cfg(feature = "gpu")]
 pub mod graphics_api;
 mod linear;
 mod op;

@@ -40,7 +40,7 @@ const GET_LPIPS: &str = "snapsnap fetch-weights alexnet lpips";
 
 pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let graphics = device::adapters();
-    let devices: Vec<Adapter> = device::processors().into_iter().chain(graphics.iter().cloned()).collect();
+    let devices: Vec<Adapter> = device::processors().chain(graphics.iter().cloned()).collect();
     let (chosen, why) = chosen(graphics);
     let weights = weights_found(arguments);
     let memory = memory::there();

@@ -5,14 +5,15 @@ use std::time::Instant;
 
 use burn::tensor::Device;
 use clap::Args;
-use snapsnap_mesh::export::{self, Kind};
+use snapsnap_mesh::export::{self, Kind, glb_bytes};
 use snapsnap_mesh::fuse::{Fused, Options, fuse};
 use snapsnap_splat::scene::Loaded;
 
 use super::convert::read;
+use super::rig;
 use crate::batch::{self, ShardArgument, must_be_unused};
 use crate::failure::Failure;
-use crate::output::check_outputs;
+use crate::output::{self, check_outputs};
 use crate::progress::Progress;
 use crate::{device, memory, say};
 
@@ -136,6 +137,8 @@ pub struct Target {
     path: PathBuf,
     companions: Vec<PathBuf>,
     options: Options,
+    /// Whether the mesh gets a skeleton; only a GLB can.
+    is_skinned: bool,
 }
 
 impl Target {
@@ -157,7 +160,18 @@ impl Target {
         let bytes = TEXEL * (texture as u64).pow(2);
         memory::check(&format!("--texture {texture}"), bytes, "choose a smaller one")?;
         let options = Options { faces: surface.faces.unwrap_or(defaults.faces), texture, ..defaults };
-        Ok(Self { path: path.to_owned(), companions: export::companions(path, texture > 0), options })
+        Ok(Self {
+            path: path.to_owned(),
+            companions: export::companions(path, texture > 0),
+            options,
+            is_skinned: false,
+        })
+    }
+
+    /// Gives the mesh a skeleton.
+    pub fn skin(&mut self) -> Result<(), Failure> {
+        self.is_skinned = Kind::named(&self.path) == Some(Kind::Glb);
+        if self.is_skinned { Ok(()) } else { Err(Failure::file(&self.path, "only a .glb has a skeleton")) }
     }
 
     pub fn files(&self) -> Vec<&Path> {
@@ -176,13 +190,24 @@ impl Target {
         }
     }
 
+    /// Makes the mesh of Gaussians.
+    pub fn fuse(&self, scene: &Loaded, progress: &Progress) -> Result<Fused, Failure> {
+        Ok(fuse(scene, self.options, &|name| progress.stage(name))?)
+    }
+
     /// Makes the mesh of Gaussians and writes it. Errors contain `name`, the Gaussians' file.
     pub fn write(&self, scene: &Loaded, name: &Path) -> Result<Fused, Failure> {
         let progress = Progress::stages();
-        let fused = fuse(scene, self.options, &|name| progress.stage(name));
-        let fused = fused.map_err(|e| Failure::from(e).about(name))?;
-        progress.stage("writing");
-        export::write(&fused.mesh, &self.path)?;
+        let fused = self.fuse(scene, &progress).map_err(|e| e.about(name))?;
+        if self.is_skinned {
+            progress.stage("skeleton");
+            let skin = rig::skeleton(scene, &fused.mesh, name)?.skin(&fused.mesh);
+            let bytes = glb_bytes(&fused.mesh, Some(&skin)).map_err(|e| Failure::Internal(e.to_string()))?;
+            output::write(&self.path, &bytes)?;
+        } else {
+            progress.stage("writing");
+            export::write(&fused.mesh, &self.path)?;
+        }
         drop(progress);
         self.warn(&fused, name);
         Ok(fused)

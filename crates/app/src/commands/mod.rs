@@ -13,6 +13,7 @@ mod pairs;
 pub mod prepare;
 pub mod reconstruct;
 pub mod render;
+pub mod rig;
 pub mod stability;
 pub mod studio;
 pub mod train;

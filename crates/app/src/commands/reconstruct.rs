@@ -86,6 +86,9 @@ pub struct Arguments {
     mesh: Option<PathBuf>,
     #[command(flatten)]
     pub surface: SurfaceArguments,
+    /// Give the mesh a skeleton. It must be a .glb.
+    #[arg(long, requires = "mesh")]
+    rig: bool,
     /// Also write every intermediate tensor.
     #[arg(long, value_name = "FILE.safetensors")]
     dump: Option<PathBuf>,
@@ -150,7 +153,10 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
     let mut times = vec![("opening weights", start.elapsed())];
     let mut timed = |name: &'static str, since: Instant| times.push((name, since.elapsed()));
     let turntable = arguments.turntable.as_deref().map(Turntable::new).transpose()?;
-    let target = arguments.mesh.as_deref().map(|path| Target::new(path, surface)).transpose()?;
+    let mut target = arguments.mesh.as_deref().map(|path| Target::new(path, surface)).transpose()?;
+    if let Some(target) = target.as_mut().filter(|_| arguments.rig) {
+        target.skin()?;
+    }
     if target.is_none() {
         surface.must_be_unused("without --mesh there is no mesh to shape")?;
     }

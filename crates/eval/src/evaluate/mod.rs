@@ -16,6 +16,7 @@ use std::time::Duration;
 use image::RgbImage;
 use rayon::prelude::*;
 use snapsnap_data::sample::{PhotographChanges, TestItem};
+use snapsnap_ops::is_cpu;
 
 use crate::Result;
 use crate::foreign::Traces;
@@ -186,7 +187,7 @@ impl Place<'_> {
         }
         let compare = |view: &usize| self.compare(&item, *view, &shown);
         // A GPU runs one task at a time.
-        let is_on_gpu = |made: &Shown| made.gaussians.device().identity().is_some();
+        let is_on_gpu = |made: &Shown| !is_cpu(&made.gaussians.device());
         let any_on_gpu = shown.iter().flatten().any(is_on_gpu);
         let times = contestants.iter().map(|contestant| contestant.views(&config.views).supersampling).max();
         let most = if any_on_gpu { 1 } else { at_once(side * times.unwrap_or(1)) };

@@ -3,15 +3,17 @@
 use std::collections::HashMap;
 use std::io;
 
-use glam::{Vec2, Vec3};
+use glam::{Affine3A, Mat4, Quat, Vec2, Vec3};
 use gltf::binary::{Glb, Header};
 use serde_json::{Value, json};
 use snapsnap_splat::linear_light;
 
 use super::png;
+use crate::import::Weights;
 use crate::mesh::{Face, Mesh, bounds};
 
 /// glTF's codes of number types.
+const U8: u32 = 5121;
 const U16: u32 = 5123;
 const U32: u32 = 5125;
 const F32: u32 = 5126;
@@ -19,12 +21,45 @@ const F32: u32 = 5126;
 const ATTRIBUTES: u32 = 34962;
 const INDICES: u32 = 34963;
 
-/// Encodes a binary glTF with one node and one primitive per material. Colours contain the light of the photographs.
+/// A skeleton, and how the positions of a mesh follow it.
+#[derive(Debug, Clone, Default)]
+pub struct Skin {
+    /// Up to 256 joints, parents first. The first one is the root.
+    pub joints: Vec<Joint>,
+    /// By position: rows of joints and their shares.
+    pub weights: Vec<Weights>,
+    /// Motions.
+    pub clips: Vec<Clip>,
+}
+
+/// A joint in the pose of the mesh.
+#[derive(Debug, Clone)]
+pub struct Joint {
+    /// Its name.
+    pub name: String,
+    /// Row of the parent; `None` for the root.
+    pub parent: Option<usize>,
+    /// From the joint's axes to the world: rotation and place, metres.
+    pub rest: Affine3A,
+}
+
+/// A motion.
+#[derive(Debug, Clone)]
+pub struct Clip {
+    /// Its name.
+    pub name: String,
+    /// Time between two frames, seconds.
+    pub step: f32,
+    /// By frame and joint: from the joint's axes to the world.
+    pub frames: Vec<Vec<Affine3A>>,
+}
+
+/// Encodes a binary glTF with one mesh, one primitive per material, and perhaps a skin. Colours contain the light of the photographs.
 /// Materials are therefore unlit (KHR_materials_unlit), and rough for viewers without this extension.
 ///
 /// # Errors
 /// If a texture cannot be encoded.
-pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
+pub fn glb_bytes(mesh: &Mesh, skin: Option<&Skin>) -> io::Result<Vec<u8>> {
     let mut file = Content::default();
     let (rows, faces) = vertices(mesh);
     let normals = mesh.normals();
@@ -49,6 +84,14 @@ pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
         let colors = file.view(rows.iter().flat_map(color).flat_map(u16::to_le_bytes), Some(ATTRIBUTES));
         let normalized = json!({ "normalized": true });
         attributes.insert("COLOR_0".into(), file.accessor(colors, U16, rows.len(), "VEC4", normalized));
+    }
+    if let Some(skin) = skin {
+        let weights = || rows.iter().map(|(p, _)| skin.weights[*p as usize]);
+        let joints = weights().flat_map(|weights| weights.map(|(joint, _)| joint as u8));
+        let joints = file.view(joints, Some(ATTRIBUTES));
+        attributes.insert("JOINTS_0".into(), file.accessor(joints, U8, rows.len(), "VEC4", json!({})));
+        let shares = weights().flat_map(|weights| weights.map(|(_, share)| share));
+        attributes.insert("WEIGHTS_0".into(), file.floats(rows.len(), "VEC4", shares, json!({})));
     }
     if rows.iter().any(|(_, t)| t.is_some()) {
         // The origin of glTF's texture coordinates is at the top.
@@ -88,10 +131,13 @@ pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
         "nodes": [{ "mesh": 0, "name": "person" }],
         "meshes": [{ "primitives": primitives }],
         "materials": materials,
-        "accessors": file.accessors,
-        "bufferViews": file.views,
-        "buffers": [{ "byteLength": file.bytes.len() }],
     });
+    if let Some(skin) = skin {
+        skin.describe(&mut document, &mut file);
+    }
+    document["accessors"] = file.accessors.split_off(0).into();
+    document["bufferViews"] = file.views.split_off(0).into();
+    document["buffers"] = json!([{ "byteLength": file.bytes.len() }]);
     if !images.is_empty() {
         document["textures"] =
             (0..images.len()).map(|source| json!({ "source": source, "sampler": 0 })).collect();
@@ -100,6 +146,72 @@ pub fn glb_bytes(mesh: &Mesh) -> io::Result<Vec<u8>> {
         document["images"] = images.into();
     }
     file.finish(&document)
+}
+
+impl Skin {
+    /// Adds the joints as nodes after the mesh's, and the motions.
+    fn describe(&self, document: &mut Value, file: &mut Content) {
+        let node = |joint: usize| 1 + joint;
+        let local = |places: &[Affine3A], joint: usize| {
+            let above = self.joints[joint].parent.map_or(Affine3A::IDENTITY, |parent| places[parent]);
+            let (_, rotation, place) = (above.inverse() * places[joint]).to_scale_rotation_translation();
+            (rotation.normalize(), place)
+        };
+        let rest: Vec<Affine3A> = self.joints.iter().map(|joint| joint.rest).collect();
+        let nodes = document["nodes"].as_array_mut().expect("the document's nodes");
+        nodes[0]["skin"] = 0.into();
+        for (row, joint) in self.joints.iter().enumerate() {
+            let (rotation, place) = local(&rest, row);
+            let children = (0..self.joints.len()).filter(|child| self.joints[*child].parent == Some(row));
+            let children: Vec<usize> = children.map(node).collect();
+            let mut described = json!({
+                "name": joint.name,
+                "rotation": rotation.to_array(),
+                "translation": place.to_array(),
+            });
+            if !children.is_empty() {
+                described["children"] = children.into();
+            }
+            nodes.push(described);
+        }
+        document["scenes"] = json!([{ "nodes": [0, node(0)] }]);
+        let inverse = rest.iter().flat_map(|rest| Mat4::from(rest.inverse()).to_cols_array());
+        let inverse = file.view(inverse.flat_map(f32::to_le_bytes), None);
+        let inverse = file.accessor(inverse, F32, rest.len(), "MAT4", json!({}));
+        let joints: Vec<usize> = (0..rest.len()).map(node).collect();
+        document["skins"] =
+            json!([{ "joints": joints, "skeleton": node(0), "inverseBindMatrices": inverse }]);
+
+        let mut animations = Vec::new();
+        for Clip { name, step, frames } in &self.clips {
+            let count = frames.len();
+            let times = (0..count).map(|frame| frame as f32 * step);
+            let range = json!({ "min": [0.0], "max": [count.saturating_sub(1) as f32 * step] });
+            let times = file.plain_floats(count, "SCALAR", times, range);
+            let (mut samplers, mut channels) = (Vec::new(), Vec::new());
+            let mut channel = |joint: usize, path: &str, output: Value| {
+                channels.push(
+                    json!({ "sampler": samplers.len(), "target": { "node": node(joint), "path": path } }),
+                );
+                samplers.push(json!({ "input": times, "output": output, "interpolation": "LINEAR" }));
+            };
+            let places = frames.iter().flat_map(|frame| local(frame, 0).1.to_array());
+            channel(0, "translation", file.plain_floats(count, "VEC3", places, json!({})));
+            for joint in 0..self.joints.len() {
+                let turns = frames.iter().scan(Quat::IDENTITY, |last, frame| {
+                    let turn = local(frame, joint).0;
+                    // The shorter way from frame to frame.
+                    *last = if last.dot(turn) < 0.0 { -turn } else { turn };
+                    Some(last.to_array())
+                });
+                channel(joint, "rotation", file.plain_floats(count, "VEC4", turns.flatten(), json!({})));
+            }
+            animations.push(json!({ "name": name, "samplers": samplers, "channels": channels }));
+        }
+        if !animations.is_empty() {
+            document["animations"] = animations.into();
+        }
+    }
 }
 
 /// Indices of a position and of its texture coordinates, if any.
@@ -144,6 +256,18 @@ impl Content {
     /// Adds an accessor of `count` vectors and returns its index.
     fn floats(&mut self, count: usize, shape: &str, values: impl Iterator<Item = f32>, more: Value) -> Value {
         let view = self.view(values.flat_map(f32::to_le_bytes), Some(ATTRIBUTES));
+        self.accessor(view, F32, count, shape, more)
+    }
+
+    /// As [`Self::floats`], for other things than vertices.
+    fn plain_floats(
+        &mut self,
+        count: usize,
+        shape: &str,
+        values: impl Iterator<Item = f32>,
+        more: Value,
+    ) -> Value {
+        let view = self.view(values.flat_map(f32::to_le_bytes), None);
         self.accessor(view, F32, count, shape, more)
     }
 

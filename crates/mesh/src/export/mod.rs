@@ -14,7 +14,7 @@ use snapsnap_base::{FileError, file};
 
 use crate::mesh::{Mesh, bytes};
 
-pub use glb::glb_bytes;
+pub use glb::{Clip, Joint, Skin, glb_bytes};
 pub use obj::write as write_obj;
 
 /// File formats of a mesh.
@@ -70,7 +70,7 @@ pub fn write(mesh: &Mesh, path: &Path) -> Result<(), FileError> {
         Kind::Ply => write_ply(mesh, out),
         Kind::Stl => print::write_stl(mesh, out),
         Kind::ThreeMf => print::write_3mf(mesh, out),
-        Kind::Glb | Kind::Obj => out.write_all(&glb_bytes(mesh)?),
+        Kind::Glb | Kind::Obj => out.write_all(&glb_bytes(mesh, None)?),
     })
     .map_err(FileError::write(path))
 }

@@ -283,7 +283,10 @@ fn distances(grid: &Grid, corners: &[usize], views: &[View]) -> Vec<f32> {
 }
 
 /// Centre and size of the box of the body's Gaussians, metres.
-fn body(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
+///
+/// # Errors
+/// [`FuseError::Nothing`], [`FuseError::Coarse`] and [`FuseError::Foreign`].
+pub fn body(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
     let opacities = host(gaussians.opacities.clone());
     let (means, scales) = (host(gaussians.means.clone()), host(gaussians.scales.clone()));
     let rows = means.as_chunks::<3>().0.iter().zip(scales.as_chunks::<3>().0);

@@ -17,7 +17,7 @@ use snapsnap_mesh::mesh::Mesh;
 use crate::figure::{Build, Figure, Pose};
 use crate::math::rotate_y;
 use crate::poses::Poses;
-use crate::skeleton::{self, Owner};
+use crate::skeleton::{self, Owner, Placed};
 use crate::synth::stand;
 use joints::{Region, Skeleton};
 
@@ -73,6 +73,20 @@ impl Avatars {
         let path = &self.files[random.random_range(0..self.files.len())];
         character(path, poses, &mut random)
     }
+}
+
+/// Transforms of the bones of a character that faces +z, with the joint names of Mixamo or MakeHuman, in a pose.
+///
+/// # Errors
+/// A sentence that names a missing joint, or a bone that is not below the hips.
+pub fn placed(bones: &[import::Bone], pose: &Pose) -> Result<Vec<Placed>, String> {
+    let skeleton = Skeleton::new(bones)?;
+    let goal = Figure::new(Build::default(), pose);
+    let placed = skeleton::placed(&skeleton.bones, &skeleton.rest, pose, &goal);
+    let row = |(bone, row): (&import::Bone, &Option<usize>)| {
+        row.map(|row| placed[row]).ok_or_else(|| format!("`{}` is not below the hips", bone.name))
+    };
+    bones.iter().zip(&skeleton.rows).map(row).collect()
 }
 
 /// The person that a file shows: its name up to the last `_`.

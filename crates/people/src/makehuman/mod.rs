@@ -17,9 +17,11 @@ mod tests;
 
 use glam::Vec3;
 use snapsnap_base::FileError;
+use snapsnap_mesh::import::Bone;
 use snapsnap_mesh::mesh::{Face, Material, Mesh, bounds};
 
 use crate::Detail;
+use crate::figure::Pose;
 use crate::poses::Poses;
 use crate::synth::paint::Painter;
 use crate::synth::surface::Surface;
@@ -38,7 +40,27 @@ pub fn person(
     poses: Option<&Poses>,
     detail: Detail,
 ) -> Result<Mesh, FileError> {
-    Ok(Person::of(library, name, poses, detail)?.mesh())
+    Ok(rigged(library, name, poses, None, detail)?.0)
+}
+
+/// The person of [`person`], perhaps in another pose, with the bones of MakeHuman's default rig.
+///
+/// # Errors
+/// As [`person`].
+pub fn rigged(
+    library: &Library,
+    name: &str,
+    poses: Option<&Poses>,
+    pose: Option<&Pose>,
+    detail: Detail,
+) -> Result<(Mesh, Vec<Bone>), FileError> {
+    let person = Person::of(library, name, poses, pose, detail)?;
+    let mut mesh = person.mesh();
+    let mut bones = person.bones();
+    let floor = mesh.bounds().0.y;
+    bones.iter_mut().for_each(|bone| bone.place.y -= floor);
+    stand(&mut mesh);
+    Ok((mesh, bones))
 }
 
 impl Person<'_> {
@@ -78,7 +100,6 @@ impl Person<'_> {
         mesh.positions = positions;
         self.add_worn(&mut mesh);
         self.add_eyes(&mut mesh);
-        stand(&mut mesh);
         mesh
     }
 

@@ -2,9 +2,10 @@
 
 use glam::Vec3;
 use snapsnap_base::{FileError, random};
+use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::bounds;
 
-use super::files::Library;
+use super::files::{Library, RigBone};
 use super::morph::{Mix, morph};
 use super::patch::{HEAD, ORDER, PARTS, Patch, Vertex};
 use super::proxy::Worn;
@@ -63,12 +64,14 @@ impl<'a> Person<'a> {
         library: &'a Library,
         name: &str,
         poses: Option<&Poses>,
+        pose: Option<&Pose>,
         detail: Detail,
     ) -> Result<Self, FileError> {
         let mut random = random::stream(&format!("makehuman/{name}"));
         let mix = Mix::draw(&mut random);
         let mut build = Build::draw(&mut random);
-        let mut pose = Poses::any(poses.or(library.poses.as_ref()), &mut random);
+        let drawn = Poses::any(poses.or(library.poses.as_ref()), &mut random);
+        let mut pose = pose.cloned().unwrap_or(drawn);
         let rest = morph(library, &mix, &mut random)?;
         let (low, high) = bounds(rest.iter().copied());
         let reach = (high - low).max_element();
@@ -129,6 +132,17 @@ impl<'a> Person<'a> {
             body,
             vertices,
         })
+    }
+
+    /// The bones in the person's pose.
+    pub fn bones(&self) -> Vec<import::Bone> {
+        let bones = self.library.bones.iter().zip(&self.placed);
+        let bone = |(bone, placed): (&RigBone, &Placed)| import::Bone {
+            name: bone.name.clone(),
+            parent: bone.parent,
+            place: placed.head,
+        };
+        bones.map(bone).collect()
     }
 
     pub fn group(&self, name: &str) -> Patch {

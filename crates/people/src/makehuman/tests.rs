@@ -77,8 +77,8 @@ fn nothing_comes_through_cloth() {
 
 fn nothing_comes_through_cloth_of(library: &Library, detail: Detail) {
     let mut found = [(0, 0); 2];
-    let people =
-        (0..).map(|index| Person::of(library, &format!("test/cloth/{index}"), None, detail).expect("made"));
+    let people = (0..)
+        .map(|index| Person::of(library, &format!("test/cloth/{index}"), None, None, detail).expect("made"));
     for person in people.filter(|person| person.worn.suit.is_none() && person.worn.shoes.is_none()).take(10) {
         let whole = person.group("body").subdivided(detail.steps(1));
         let [bottom, top] = person.layers();
@@ -109,8 +109,9 @@ fn nothing_comes_through_cloth_of(library: &Library, detail: Detail) {
 fn suits_cover_what_is_below_them() {
     let Some(library) = library() else { return };
     let (mut out, mut all, mut suits) = (0, 0, HashSet::new());
-    let people = (0..)
-        .map(|index| Person::of(&library, &format!("test/suit/{index}"), None, Detail::Fine).expect("made"));
+    let people = (0..).map(|index| {
+        Person::of(&library, &format!("test/suit/{index}"), None, None, Detail::Fine).expect("made")
+    });
     for person in people.filter(|person| person.worn.suit.is_some()).take(12) {
         let suit = person.worn.suit.as_ref().expect("is worn");
         suits.insert(std::sync::Arc::as_ptr(suit));
@@ -177,7 +178,8 @@ fn damaged_proxies_are_named() {
 fn hands_do_not_sink_into_the_body() {
     let Some(library) = library() else { return };
     for index in 0..30 {
-        let person = Person::of(&library, &format!("test/hands/{index}"), None, Detail::Fine).expect("made");
+        let person =
+            Person::of(&library, &format!("test/hands/{index}"), None, None, Detail::Fine).expect("made");
         assert_eq!(rig::sunk_hands(&person.group("body"), 0.005), [false; 2], "person {index}");
     }
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+#[cfg(feature = "gpu")]
 #[allow(deprecated, reason = "the CPU test backend")]
 use burn::backend::NdArray;
 use burn::backend::flex::FlexTensor;
@@ -58,6 +59,7 @@ macro_rules! on_the_cpu {
 }
 
 on_the_cpu!(Flex, FlexTensor::to_contiguous, slice);
+#[cfg(feature = "gpu")]
 on_the_cpu!(NdArray, read::<NdArray>, Vec::as_slice);
 
 fn slice(tensor: &FlexTensor) -> &[f32] {

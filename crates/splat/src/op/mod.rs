@@ -5,6 +5,7 @@
 
 mod cpu;
 mod flex_ndarray;
+#[cfg(feature = "gpu")]
 mod gpu;
 mod gradient;
 mod inputs;
@@ -64,7 +65,8 @@ fn channels<B: Backend>(image: FloatTensor<B>, range: Range<usize>) -> FloatTens
 }
 
 /// Backends with the splatting operation. Users call [`render`](crate::render()).
-#[backend_extension(Cube, Flex, NdArray, Autodiff)]
+#[cfg_attr(feature = "gpu", backend_extension(Cube, Flex, NdArray, Autodiff))]
+#[cfg_attr(not(feature = "gpu"), backend_extension(Flex, Autodiff))]
 pub trait SplatBackend: Backend {
     /// Renders `inputs`.
     fn splat(#[extension_type] inputs: SplatInputs<Self>, job: Arc<Job>) -> SplatOutput<Self>;

@@ -1,0 +1,288 @@
+//! Skin weights: heat that spreads from the bones within the closed body (Baran and Popović, "Automatic Rigging and
+//! Animation of 3D Characters", 2007), here in the cells of a grid, so that mesh and Gaussians follow one field. Ways lead
+//! through the body: an arm beside the hip is far from it.
+
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, VecDeque};
+
+use glam::{IVec3, Vec3};
+use rayon::prelude::*;
+use snapsnap_mesh::import::Weights;
+use snapsnap_mesh::mesh::Mesh;
+
+/// Cells along the longest side of the body's box.
+const CELLS: f32 = 180.0;
+/// Cells around the body, at which Gaussians may lie.
+const BORDER: i32 = 3;
+/// Heat that flows from the nearest bone, beside the heat that flows between cells a bone's distance apart.
+const HEAT: f32 = 1.0;
+/// Rounds of conjugate gradients. Heat spreads by about the distance to the bone, which is some cells.
+const ROUNDS: usize = 60;
+/// Residual at which a bone's heat is known, relative to the first one.
+const ACCURATE: f32 = 1e-3;
+/// No cell.
+const NONE: u32 = u32::MAX;
+
+/// A bone as a source of heat.
+#[derive(Debug, Clone)]
+pub struct Source {
+    /// Row of the bone in the skeleton.
+    pub bone: usize,
+    /// Both ends, metres.
+    pub ends: [Vec3; 2],
+    /// Distance of a limb from its skin in metres, and the bone that cloth beyond it follows.
+    pub cloth: Option<(f32, usize)>,
+}
+
+/// Skin weights everywhere in and around a body.
+#[derive(Debug, Clone)]
+pub struct Field {
+    /// Centre of the first cell, and edge of a cell, metres.
+    origin: Vec3,
+    cell: f32,
+    counts: IVec3,
+    /// By cell, x first: row of `weights` of the nearest cell inside.
+    rows: Vec<u32>,
+    weights: Vec<Weights>,
+}
+
+impl Field {
+    /// The field of a closed mesh. `bones` is the number of bones. `None` if no bone lies in the mesh.
+    pub fn new(mesh: &Mesh, sources: &[Source], bones: usize) -> Option<Self> {
+        let (low, high) = mesh.bounds();
+        let cell = (high - low).max_element() / CELLS;
+        let origin = low - BORDER as f32 * cell;
+        let counts = ((high - low) / cell).ceil().as_ivec3() + 2 * BORDER;
+        let cells = counts.as_usizevec3().element_product();
+        let mut field = Self { origin, cell, counts, rows: vec![NONE; cells], weights: Vec::new() };
+        let inside = field.inside(mesh);
+        inside.iter().enumerate().for_each(|(row, cell)| field.rows[*cell] = row as u32);
+        let nearest = field.nearest(&inside, sources);
+        if nearest.iter().all(|(_, length)| length.is_infinite()) {
+            return None;
+        }
+        field.weights = field.heat(&inside, sources, &nearest, bones);
+        field.extend();
+        Some(field)
+    }
+
+    /// The weights at a place: those of the eight cells around it.
+    pub fn at(&self, place: Vec3) -> Weights {
+        let last = (self.counts - 2).as_vec3();
+        let at = ((place - self.origin) / self.cell).clamp(Vec3::ZERO, last);
+        let low = at.as_ivec3().min(self.counts - 2);
+        let share = at - low.as_vec3();
+        let mut sums: Vec<(u32, f32)> = Vec::with_capacity(16);
+        for corner in 0..8 {
+            let step = IVec3::new(corner & 1, corner >> 1 & 1, corner >> 2);
+            let parts = Vec3::select(step.cmpeq(IVec3::ONE), share, 1.0 - share);
+            let weights = &self.weights[self.rows[self.index(low + step)] as usize];
+            for (bone, weight) in weights.iter().filter(|(_, weight)| *weight > 0.0) {
+                let weight = weight * parts.element_product();
+                match sums.iter_mut().find(|(known, _)| known == bone) {
+                    Some((_, sum)) => *sum += weight,
+                    None => sums.push((*bone, weight)),
+                }
+            }
+        }
+        largest(sums)
+    }
+
+    fn index(&self, at: IVec3) -> usize {
+        ((at.z * self.counts.y + at.y) * self.counts.x + at.x) as usize
+    }
+
+    fn place(&self, cell: usize) -> IVec3 {
+        let (cell, IVec3 { x, y, .. }) = (cell as i32, self.counts);
+        IVec3::new(cell % x, cell / x % y, cell / (x * y))
+    }
+
+    /// The cell that contains a place.
+    fn containing(&self, place: Vec3) -> IVec3 {
+        ((place - self.origin) / self.cell).round().as_ivec3().clamp(IVec3::ZERO, self.counts - 1)
+    }
+
+    /// Cells whose centres are inside of the mesh: along z, the inside lies between the first and the second triangle, and
+    /// so on.
+    fn inside(&self, mesh: &Mesh) -> Vec<usize> {
+        // Off the middle, so that no line meets an edge of triangles between cells.
+        let shift = Vec3::new(1.3e-3, 2.9e-3, 0.0);
+        let mut crossings = vec![Vec::new(); (self.counts.x * self.counts.y) as usize];
+        for face in &mesh.faces {
+            let corner = |row: u32| (mesh.positions[row as usize] - self.origin) / self.cell - shift;
+            let [a, b, c] = face.positions.map(corner);
+            let [low, high] = [a.min(b).min(c).ceil().as_ivec3(), a.max(b).max(c).floor().as_ivec3()];
+            let (u, v) = (b - a, c - a);
+            let area = u.x * v.y - u.y * v.x;
+            for (x, y) in (low.y..=high.y).flat_map(|y| (low.x..=high.x).map(move |x| (x, y))) {
+                let d = Vec3::new(x as f32, y as f32, 0.0) - a;
+                let (s, t) = ((d.x * v.y - d.y * v.x) / area, (u.x * d.y - u.y * d.x) / area);
+                if s >= 0.0 && t >= 0.0 && s + t <= 1.0 {
+                    crossings[(y * self.counts.x + x) as usize].push(a.z + s * u.z + t * v.z);
+                }
+            }
+        }
+        let column = |(column, mut depths): (usize, Vec<f32>)| {
+            depths.sort_by(f32::total_cmp);
+            let cells = depths
+                .as_chunks::<2>()
+                .0
+                .iter()
+                .flat_map(|[from, to]| from.ceil() as i32..=to.floor() as i32);
+            let sheet = (self.counts.x * self.counts.y) as usize;
+            cells.map(move |z| z as usize * sheet + column).collect::<Vec<_>>()
+        };
+        crossings.into_iter().enumerate().flat_map(column).collect()
+    }
+
+    /// For every cell inside its nearest source and the length of the way to it through the body, metres.
+    fn nearest(&self, inside: &[usize], sources: &[Source]) -> Vec<(usize, f32)> {
+        let mut nearest = vec![(0, f32::INFINITY); inside.len()];
+        // Distances as bits: those of numbers above 0 have the same order.
+        let mut open = BinaryHeap::new();
+        for (source, Source { ends: [from, to], .. }) in sources.iter().enumerate() {
+            let steps = (from.distance(*to) / (0.5 * self.cell)).ceil().max(1.0) as usize;
+            for step in 0..=steps {
+                let place = from.lerp(*to, step as f32 / steps as f32);
+                let row = self.rows[self.index(self.containing(place))];
+                if row != NONE {
+                    let centre = self.origin + self.cell * self.place(inside[row as usize]).as_vec3();
+                    open.push(Reverse((centre.distance(place).to_bits(), row, source)));
+                }
+            }
+        }
+        while let Some(Reverse((bits, row, source))) = open.pop() {
+            let length = f32::from_bits(bits);
+            if length >= nearest[row as usize].1 {
+                continue;
+            }
+            nearest[row as usize] = (source, length);
+            let at = self.place(inside[row as usize]);
+            for (step, distance) in around() {
+                let next = self.rows[self.index(at + step)];
+                let length = length + self.cell * distance;
+                if next != NONE && length < nearest[next as usize].1 {
+                    open.push(Reverse((length.to_bits(), next, source)));
+                }
+            }
+        }
+        nearest
+    }
+
+    /// The weights of all cells inside: for every bone the temperatures w of (L + H) w = H p. L is the Laplacian, and p is
+    /// 1 where the bone is the nearest one; H falls with the square of its distance.
+    fn heat(
+        &self,
+        inside: &[usize],
+        sources: &[Source],
+        nearest: &[(usize, f32)],
+        bones: usize,
+    ) -> Vec<Weights> {
+        let steps = [IVec3::X, IVec3::Y, IVec3::Z, IVec3::NEG_X, IVec3::NEG_Y, IVec3::NEG_Z];
+        let neighbours: Vec<[u32; 6]> = inside
+            .iter()
+            .map(|cell| steps.map(|step| self.rows[self.index(self.place(*cell) + step)]))
+            .collect();
+        let heat = |(_, length): &(usize, f32)| {
+            // A cell without a way to a bone has the weights of its neighbours.
+            HEAT * (self.cell / length.max(0.5 * self.cell)).powi(2)
+        };
+        let heats: Vec<f32> = nearest.iter().map(heat).collect();
+        let share = |bone: usize, (source, length): (usize, f32)| {
+            let source = &sources[source];
+            let cloth = source.cloth.map_or(0.0, |(skin, _)| ((length / skin - 1.0) / 0.5).clamp(0.0, 1.0));
+            let own = if source.bone == bone { 1.0 - cloth } else { 0.0 };
+            own + if source.cloth.is_some_and(|(_, follows)| follows == bone) { cloth } else { 0.0 }
+        };
+        let temperatures: Vec<Vec<f32>> = (0..bones)
+            .into_par_iter()
+            .map(|bone| {
+                let shares: Vec<f32> = nearest.iter().map(|near| share(bone, *near)).collect();
+                solve(&neighbours, &heats, &shares)
+            })
+            .collect();
+        let weights = |row: usize| {
+            largest((0..bones).map(|bone| (bone as u32, temperatures[bone][row].max(0.0))).collect())
+        };
+        (0..inside.len()).into_par_iter().map(weights).collect()
+    }
+
+    /// Gives the cells outside the weights of a near cell inside.
+    fn extend(&mut self) {
+        let mut open: VecDeque<usize> =
+            (0..self.rows.len()).filter(|cell| self.rows[*cell] != NONE).collect();
+        while let Some(cell) = open.pop_front() {
+            let at = self.place(cell);
+            for (step, _) in around() {
+                let next = at + step;
+                if next.cmplt(IVec3::ZERO).any() || next.cmpge(self.counts).any() {
+                    continue;
+                }
+                let next = self.index(next);
+                if self.rows[next] == NONE {
+                    self.rows[next] = self.rows[cell];
+                    open.push_back(next);
+                }
+            }
+        }
+    }
+}
+
+/// Steps to the 26 neighbours of a cell, with their lengths in cells.
+fn around() -> impl Iterator<Item = (IVec3, f32)> {
+    let steps = (-1..=1).flat_map(|z| (-1..=1).flat_map(move |y| (-1..=1).map(move |x| IVec3::new(x, y, z))));
+    steps.filter(|step| *step != IVec3::ZERO).map(|step| (step, step.as_vec3().length()))
+}
+
+/// Solves (L + H) w = H p by conjugate gradients, with the diagonal as preconditioner.
+fn solve(neighbours: &[[u32; 6]], heats: &[f32], shares: &[f32]) -> Vec<f32> {
+    let mut w = shares.to_vec();
+    if shares.iter().all(|share| *share == 0.0) {
+        return w;
+    }
+    let there = |around: &[u32; 6]| around.iter().filter(|next| **next != NONE).count() as f32;
+    let diagonal: Vec<f32> =
+        neighbours.iter().zip(heats).map(|(around, heat)| there(around) + heat).collect();
+    let times = |x: &[f32], out: &mut [f32]| {
+        for (row, out) in out.iter_mut().enumerate() {
+            let sum: f32 =
+                neighbours[row].iter().filter(|next| **next != NONE).map(|next| x[*next as usize]).sum();
+            *out = diagonal[row] * x[row] - sum;
+        }
+    };
+    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+    let mut product = vec![0.0; w.len()];
+    times(&w, &mut product);
+    let mut rest: Vec<f32> = (0..w.len()).map(|row| heats[row] * shares[row] - product[row]).collect();
+    let mut scaled: Vec<f32> = rest.iter().zip(&diagonal).map(|(r, d)| r / d).collect();
+    let mut way = scaled.clone();
+    let mut size = dot(&rest, &scaled);
+    let first = size;
+    for _ in 0..ROUNDS {
+        if size <= f64::from(ACCURATE * ACCURATE) * first {
+            break;
+        }
+        times(&way, &mut product);
+        let step = (size / dot(&way, &product)) as f32;
+        for row in 0..w.len() {
+            w[row] += step * way[row];
+            rest[row] -= step * product[row];
+            scaled[row] = rest[row] / diagonal[row];
+        }
+        let next = dot(&rest, &scaled);
+        let keep = (next / size) as f32;
+        way.iter_mut().zip(&scaled).for_each(|(way, scaled)| *way = scaled + keep * *way);
+        size = next;
+    }
+    w
+}
+
+/// The four largest weights, with a sum of 1.
+fn largest(mut sums: Vec<(u32, f32)>) -> Weights {
+    sums.sort_by(|a, b| b.1.total_cmp(&a.1));
+    let mut weights = Weights::default();
+    weights.iter_mut().zip(&sums).for_each(|(to, from)| *to = *from);
+    let sum: f32 = weights.iter().map(|(_, weight)| weight).sum();
+    weights.iter_mut().for_each(|(_, weight)| *weight /= sum.max(f32::MIN_POSITIVE));
+    weights
+}
