@@ -15,8 +15,8 @@ use burn::tensor::{FloatDType, Tensor};
 
 use crate::device::{has_kernels, in_f32, is_bf16, is_tracked_on_gpu};
 use crate::gpu_convolution::convolve;
-use crate::op::{self, Given, InputGradients, Kept, Kernel};
-use crate::operators::{Convolution, Layer, LayerNorm, Linear};
+use crate::op::{self, Kernel};
+use crate::operators::{Convolution, LayerNorm, Linear};
 
 /// A linear layer: `[B, N, inputs]` → `[B, N, outputs]`.
 pub fn linear(layer: &nn::Linear, x: Tensor<3>) -> Tensor<3> {
@@ -145,28 +145,8 @@ fn bias(bias: &Option<Param<Tensor<1>>>) -> Option<Tensor<1>> {
     bias.as_ref().map(Param::val)
 }
 
-/// A layer as an operator.
-#[derive(Debug)]
-struct Operator<L> {
-    layer: L,
-    has_bias: bool,
-}
-
-impl<L: Layer> Kernel for Operator<L> {
-    fn forward(&self, [x, weight, bias]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
-        let (out, kept) = self.layer.forward([x, weight], self.has_bias.then_some(bias), keep);
-        (out, keep.then(|| Box::new(kept) as _))
-    }
-
-    fn backward(&self, Given { inputs: [x, weight, _], kept, upstream, wanted }: Given) -> InputGradients {
-        let [of_input, of_weight, of_bias] = wanted;
-        let kept = kept.and_then(|kept| kept.downcast::<L::Kept>().ok()).expect("kept by the forward pass");
-        self.layer.backward([x, weight, upstream], *kept, [of_input, of_weight, of_bias && self.has_bias])
-    }
-}
-
 fn run<const A: usize, const W: usize, const D: usize>(
-    layer: impl Layer,
+    layer: impl Kernel,
     shape: [usize; D],
     x: Tensor<A>,
     weight: Tensor<W>,
@@ -174,5 +154,5 @@ fn run<const A: usize, const W: usize, const D: usize>(
 ) -> Tensor<D> {
     // Kernels read f32 and round the factors themselves.
     let (weight, bias) = (weight.cast(FloatDType::F32), bias.map(|bias| bias.cast(FloatDType::F32)));
-    op::run(Operator { layer, has_bias: bias.is_some() }, shape, x, Some(weight), bias)
+    op::run(layer, shape, x, Some(weight), bias)
 }

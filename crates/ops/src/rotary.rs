@@ -5,7 +5,7 @@ use burn::tensor::module::attention;
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::device::{has_kernels, host, in_f32};
-use crate::op::{self, Given, InputGradients, Kept, Kernel};
+use crate::op;
 use crate::operators::Attention;
 
 /// Cosines and sines of every token's rotation angles, for one grid and one head size.
@@ -58,9 +58,9 @@ pub fn rotary_attention([q, k, v]: [Tensor<3>; 3], rope: &Rope, heads: usize, in
     }
     let [batch, tokens, c] = q.dims();
     assert_eq!([k.dims(), v.dims()], [q.dims(); 2], "queries, keys and values of one grid");
-    let sizes = Attention { batch, tokens, heads, head_dim: c / heads, in_bf16 };
-    let tables = [&rope.cos, &rope.sin].map(|table| host(table.clone()));
-    op::run(Attend { sizes, tables }, q.dims(), q, Some(k), Some(v))
+    let rope = [&rope.cos, &rope.sin].map(|table| host(table.clone()));
+    let kernel = Attention { batch, tokens, heads, head_dim: c / heads, in_bf16, rope };
+    op::run(kernel, q.dims(), q, Some(k), Some(v))
 }
 
 /// [`rotary_attention`] with queries, keys and values side by side in one tensor: `[B, N, 3·C]` → `[B, N, C]`.
@@ -76,29 +76,4 @@ pub(crate) fn plain_attention([q, k, v]: [Tensor<3>; 3], rope: &Rope, heads: usi
     let (q, k) = (rope.apply(split(q)), rope.apply(split(k)));
     let out = attention(q, k, split(v), None, None, Default::default());
     out.swap_dims(1, 2).reshape([b, n, c])
-}
-
-/// Rotary attention.
-#[derive(Debug)]
-struct Attend {
-    sizes: Attention,
-    /// Tables of cos and ±sin, as in [`Rope`].
-    tables: [Vec<f32>; 2],
-}
-
-impl Kernel for Attend {
-    fn forward(&self, inputs: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
-        let tables = self.tables.each_ref().map(Vec::as_slice);
-        let (out, logarithms) = self.sizes.forward(inputs, tables);
-        (out, keep.then(|| Box::new(logarithms) as _))
-    }
-
-    fn backward(&self, Given { inputs, kept, upstream, wanted }: Given) -> InputGradients {
-        let logarithms =
-            kept.and_then(|kept| kept.downcast::<Vec<f32>>().ok()).expect("kept by the forward pass");
-        let tables = self.tables.each_ref().map(Vec::as_slice);
-        let gradients = self.sizes.backward(inputs, tables, &logarithms, upstream);
-        let mut wanted = wanted.into_iter();
-        gradients.map(|gradient| wanted.next().expect("three of each").then_some(gradient))
-    }
 }

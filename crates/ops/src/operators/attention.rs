@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use crate::buffers::{Floats, take};
 use crate::math::exp;
 use crate::multiply::{Matrix, Right, product};
+use crate::op::{Given, InputGradients, Kept, Kernel};
 use crate::vectors::vectorized;
 
 /// Queries per block of the forward pass: 128 × 1024 scores of 4 bytes fit a second-level cache.
@@ -16,8 +17,8 @@ const FORWARD_BLOCK: usize = 128;
 /// Queries per block of the backward pass: 64 × 1024 scores and their gradients are of the same size.
 const BLOCK: usize = 64;
 
-/// Sizes of an attention; tokens hold `heads · head_dim` channels.
-#[derive(Debug, Clone, Copy)]
+/// Sizes of an attention and its rotations; tokens hold `heads · head_dim` channels.
+#[derive(Debug)]
 pub struct Attention {
     /// Samples.
     pub batch: usize,
@@ -29,22 +30,21 @@ pub struct Attention {
     pub head_dim: usize,
     /// Products in bf16, if the processor has the instructions.
     pub in_bf16: bool,
+    /// Tables of cos and ±sin, `[tokens, head_dim]` each, as [`crate::Rope`] holds them.
+    pub rope: [Vec<f32>; 2],
 }
 
-/// Rotation tables cos and ±sin, `[tokens, head_dim]` each, as [`crate::Rope`] holds them.
-pub type Tables<'a> = [&'a [f32]; 2];
-
-impl Attention {
-    /// softmax(rotated q · rotated kᵀ / √head_dim) · v of queries, keys and values `[B, tokens, C]` → `[B, tokens, C]`,
-    /// and the logarithms of the rows' sums of exponentials, `[B, heads, tokens]`.
-    pub fn forward(&self, [q, k, v]: [&[f32]; 3], rope: Tables) -> (Vec<f32>, Vec<f32>) {
+impl Kernel for Attention {
+    /// softmax(rotated q · rotated kᵀ / √head_dim) · v of queries, keys and values `[B, tokens, C]` → `[B, tokens, C]`.
+    /// Keeps the logarithms of the rows' sums of exponentials, `[B, heads, tokens]`.
+    fn forward(&self, [q, k, v]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let Self { tokens, head_dim: d, .. } = *self;
         let mut by_head = Floats::new(self.batch * tokens * self.heads * d);
         let mut logarithms = vec![0.0; self.batch * self.heads * tokens];
         let heads = by_head.par_chunks_exact_mut(tokens * d).zip(logarithms.par_chunks_exact_mut(tokens));
         heads.enumerate().for_each(|(i, (out, logarithms))| {
             let [packed_q, packed_k] =
-                [(q, self.scale()), (k, 1.0)].map(|(x, factor)| self.pack(x, i, rope, factor));
+                [(q, self.scale()), (k, 1.0)].map(|(x, factor)| self.pack(x, i, factor));
             let across = self.right([d, tokens], (&packed_k, [d, 1]));
             let values = self.right([tokens, d], (self.head(v, i), [1, self.heads * d]));
             let mut scores = Floats::new(FORWARD_BLOCK.min(tokens) * tokens);
@@ -60,18 +60,13 @@ impl Attention {
                 }
             }
         });
-        (self.by_token(&by_head), logarithms)
+        (self.by_token(&by_head), keep.then(|| Box::new(logarithms) as _))
     }
 
-    /// Gradients of queries, keys and values from the output's gradient `dy` `[B, tokens, C]`. One function computes
-    /// all three, because they share nearly all of the work.
-    pub fn backward(
-        &self,
-        [q, k, v]: [&[f32]; 3],
-        rope: Tables,
-        logarithms: &[f32],
-        dy: &[f32],
-    ) -> [Vec<f32>; 3] {
+    /// Computes all gradients, wanted or not, because they share nearly all of the work.
+    fn backward(&self, Given { inputs: [q, k, v], kept, upstream: dy, wanted }: Given) -> InputGradients {
+        let kept = kept.and_then(|kept| kept.downcast::<Vec<f32>>().ok());
+        let logarithms = kept.expect("kept by the forward pass");
         let Self { tokens, head_dim: d, .. } = *self;
         let width = self.heads * d;
         let mut by_head = [(); 3].map(|()| Floats::new(self.batch * tokens * width));
@@ -80,7 +75,7 @@ impl Attention {
         let heads = heads.zip(dv.par_chunks_exact_mut(tokens * d)).enumerate();
         heads.for_each(|(i, ((dq, dk), dv))| {
             let [packed_q, packed_k] =
-                [(q, self.scale()), (k, 1.0)].map(|(x, factor)| self.pack(x, i, rope, factor));
+                [(q, self.scale()), (k, 1.0)].map(|(x, factor)| self.pack(x, i, factor));
             let (values, dy) = (self.head(v, i), self.head(dy, i));
             let across = [(&packed_k[..], [d, 1]), (values, [width, 1])].map(|x| self.right([d, tokens], x));
             let along = self.right([tokens, d], (&packed_k, [1, d]));
@@ -99,12 +94,14 @@ impl Attention {
                 product([tokens, d, rows], (gradients, [tokens, 1]), &of_block[0], dk, add);
                 product([tokens, d, rows], (scores, [tokens, 1]), &of_block[1], dv, add);
             }
-            rotate(dq, d, rope, self.scale(), -1.0);
-            rotate(dk, d, rope, 1.0, -1.0);
+            rotate(dq, d, &self.rope, self.scale(), -1.0);
+            rotate(dk, d, &self.rope, 1.0, -1.0);
         });
-        by_head.map(|values| self.by_token(&values))
+        [0, 1, 2].map(|i| wanted[i].then(|| self.by_token(&by_head[i])))
     }
+}
 
+impl Attention {
     fn right<'a>(&self, size: [usize; 2], matrix: Matrix<'a>) -> Right<'a> {
         Right::new(self.in_bf16, size, matrix)
     }
@@ -119,13 +116,13 @@ impl Attention {
     }
 
     /// The tokens `[tokens, head_dim]` of head `i`, rotated and multiplied by `factor`.
-    fn pack(&self, x: &[f32], i: usize, rope: Tables, factor: f32) -> Floats {
+    fn pack(&self, x: &[f32], i: usize, factor: f32) -> Floats {
         let d = self.head_dim;
         let mut out = Floats::new(self.tokens * d);
         for (out, x) in out.chunks_exact_mut(d).zip(self.head(x, i).chunks(self.heads * d)) {
             out.copy_from_slice(&x[..d]);
         }
-        rotate(&mut out, d, rope, factor, 1.0);
+        rotate(&mut out, d, &self.rope, factor, 1.0);
         out
     }
 
@@ -148,7 +145,7 @@ impl Attention {
 }
 
 /// Rotates one head's tokens in place, and scales them. `sign`: 1, or −1 to rotate back.
-fn rotate(x: &mut [f32], d: usize, rope: Tables, factor: f32, sign: f32) {
+fn rotate(x: &mut [f32], d: usize, rope: &[Vec<f32>; 2], factor: f32, sign: f32) {
     let quarter = d / 4;
     vectorized!(move || {
         let tables = rope[0].chunks_exact(d).zip(rope[1].chunks_exact(d));

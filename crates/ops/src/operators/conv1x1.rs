@@ -25,7 +25,7 @@ struct Block<'a> {
 
 impl Convolution {
     /// The result of a 1×1 convolution.
-    pub(super) fn pointwise(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
+    pub(super) fn pointwise(&self, x: &[f32], weight: &[f32], bias: &[f32]) -> Vec<f32> {
         let (Self { inputs, outputs, .. }, pixels) = (*self, self.pixels());
         let mut out = take(self.batch * outputs * pixels);
         self.blocks(Some((&mut out, outputs))).into_par_iter().for_each(|block| {
@@ -35,8 +35,7 @@ impl Convolution {
             let x = Right::new(self.in_bf16, [inputs, n], self.read(x, n, &mut read));
             product([outputs, n, inputs], (weight, [1, inputs]), &x, &mut results, false);
             for (c, (out, results)) in block.out.into_iter().zip(results.chunks_exact(n)).enumerate() {
-                let bias = bias.map_or(0.0, |bias| bias[c]);
-                add_constant(results, bias, out);
+                add_constant(results, bias.get(c).copied().unwrap_or(0.0), out);
             }
         });
         out

@@ -30,7 +30,7 @@ const FEW_PIXELS: usize = 1024;
 
 impl Convolution {
     /// The result of a 3×3 convolution with stride 1.
-    pub(super) fn winograd(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
+    pub(super) fn winograd(&self, x: &[f32], weight: &[f32], bias: &[f32]) -> Vec<f32> {
         let filters = self.transformed(weight, [9 * self.inputs, 9], false);
         self.run(x, &filters, bias, None)
     }
@@ -41,7 +41,7 @@ impl Convolution {
         let input = of_input.then(|| {
             let back = Self { inputs: self.outputs, outputs: self.inputs, rectified: false, ..*self };
             let filters = back.transformed(weight, [9, 9 * self.inputs], true);
-            back.run(dy, &filters, None, self.rectified.then_some(x))
+            back.run(dy, &filters, &[], self.rectified.then_some(x))
         });
         if of_weight && self.batch * self.pixels() <= FEW_PIXELS {
             let [_, weight, bias] = self.unfolded_gradients(given, [false, true, of_bias]);
@@ -69,10 +69,10 @@ impl Convolution {
     }
 
     /// Winograd's method with transformed filters. The result is 0 where `mask` is not positive, if there is a mask.
-    fn run(&self, x: &[f32], filters: &[f32], bias: Option<&[f32]>, mask: Option<&[f32]>) -> Vec<f32> {
+    fn run(&self, x: &[f32], filters: &[f32], bias: &[f32], mask: Option<&[f32]>) -> Vec<f32> {
         let (Self { height, width, rectified, .. }, plane) = (*self, self.pixels());
         assert_eq!(x.len(), self.batch * self.inputs * plane);
-        let mut padded = bias.unwrap_or_default().to_vec();
+        let mut padded = bias.to_vec();
         padded.resize(self.outputs.next_multiple_of(GROUP), 0.0);
         let mut out = take(self.batch * self.outputs * plane);
         let band = self.band_rows();

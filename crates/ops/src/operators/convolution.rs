@@ -1,7 +1,6 @@
 //! Convolutions with zero padding of half a kernel, on images `[B, C, H, W]`.
 
-use super::Layer;
-use crate::op::InputGradients;
+use crate::op::{Given, InputGradients, Kept, Kernel};
 
 /// Sizes of a convolution, and whether it reads max(x, 0) instead of its input x.
 #[derive(Debug, Clone, Copy)]
@@ -26,21 +25,20 @@ pub struct Convolution {
     pub in_bf16: bool,
 }
 
-impl Layer for Convolution {
-    type Kept = ();
-
+impl Kernel for Convolution {
     /// `x` `[B, inputs, H, W]`, `weight` `[outputs, inputs, side, side]`, `bias` `[outputs]` →
     /// `[B, outputs, ⌈H/stride⌉, ⌈W/stride⌉]`.
-    fn forward(&self, [x, weight]: [&[f32]; 2], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, ()) {
+    fn forward(&self, [x, weight, bias]: [&[f32]; 3], _keep: bool) -> (Vec<f32>, Kept) {
         let out = match (self.side, self.stride) {
             (1, _) => self.pointwise(x, weight, bias),
             (_, 1) => self.winograd(x, weight, bias),
             _ => self.unfolded(x, weight, bias),
         };
-        (out, ())
+        (out, None)
     }
 
-    fn backward(&self, given: [&[f32]; 3], (): (), wanted: [bool; 3]) -> InputGradients {
+    fn backward(&self, Given { inputs: [x, weight, _], upstream, wanted, .. }: Given) -> InputGradients {
+        let given = [x, weight, upstream];
         match (self.side, self.stride) {
             (1, _) => self.pointwise_gradients(given, wanted),
             (_, 1) => self.winograd_gradients(given, wanted),

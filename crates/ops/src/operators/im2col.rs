@@ -21,7 +21,7 @@ const CHANNELS: usize = 16;
 
 impl Convolution {
     /// The result of a 3×3 convolution.
-    pub(super) fn unfolded(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
+    pub(super) fn unfolded(&self, x: &[f32], weight: &[f32], bias: &[f32]) -> Vec<f32> {
         let (Self { inputs, outputs, .. }, plane) = (*self, self.pixels());
         let [rows, columns] = self.size();
         let mut out = take(self.batch * outputs * rows * columns);
@@ -43,7 +43,7 @@ impl Convolution {
             let rhs = Right::Plain((&taps, [1, n]));
             product([outputs, n, inputs * TAPS], lhs, &rhs, &mut results, false);
             for (c, (out, results)) in out.into_iter().zip(results.chunks_exact(n)).enumerate() {
-                add_constant(results, bias.map_or(0.0, |bias| bias[c]), out);
+                add_constant(results, bias.get(c).copied().unwrap_or(0.0), out);
             }
         });
         out

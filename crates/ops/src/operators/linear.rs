@@ -4,11 +4,11 @@
 use rayon::prelude::*;
 
 use super::elements::{add_rows, add_to_rows};
-use super::{Layer, join, parts};
+use super::{join, parts};
 use crate::buffers::{Floats, take};
 use crate::math::{gelu, gelu_derivative};
 use crate::multiply::{Right, product};
-use crate::op::InputGradients;
+use crate::op::{Given, InputGradients, Kept, Kernel};
 use crate::vectors::vectorized;
 
 /// Rows per task of the products over rows.
@@ -35,12 +35,10 @@ pub struct Linear {
     pub gelu: bool,
 }
 
-impl Layer for Linear {
-    /// The values before GELU `[rows, outputs]`, if kept.
-    type Kept = Option<Floats>;
-
-    /// x · weight + bias, then GELU if the layer has it: `x` `[rows, inputs]` → `[rows, outputs]`.
-    fn forward(&self, [x, weight]: [&[f32]; 2], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept) {
+impl Kernel for Linear {
+    /// x · weight + bias, then GELU if the layer has it: `x` `[rows, inputs]` → `[rows, outputs]`. Keeps the values
+    /// before GELU.
+    fn forward(&self, [x, weight, bias]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let (size, piece) = (self.rows * self.outputs, ROWS * self.outputs);
         let (mut out, mut before) = (take(size), (self.gelu && keep).then(|| Floats::new(size)));
         let weight = Right::new(self.in_bf16, [self.inputs, self.outputs], (weight, self.strides()));
@@ -58,11 +56,13 @@ impl Layer for Linear {
                 }
             }
         });
-        (out, before)
+        (out, before.map(|before| Box::new(before) as _))
     }
 
-    fn backward(&self, given: [&[f32]; 3], before: Option<Floats>, wanted: [bool; 3]) -> InputGradients {
-        let ([x, weight, dy], [of_input, of_weight, of_bias]) = (given, wanted);
+    fn backward(&self, given: Given) -> InputGradients {
+        let Given { inputs: [x, weight, _], kept, upstream: dy, wanted: [of_input, of_weight, of_bias] } =
+            given;
+        let before = kept.and_then(|kept| kept.downcast::<Floats>().ok());
         assert_eq!(before.is_some(), self.gelu, "kept by the forward pass");
         let Self { rows, inputs, outputs, .. } = *self;
         let blocks = rows.div_ceil(ROWS);
@@ -119,10 +119,11 @@ impl Linear {
         if self.transposed { [self.inputs, 1] } else { [1, self.outputs] }
     }
 
-    fn product(&self, x: &[f32], rhs: &Right, bias: Option<&[f32]>, out: &mut [f32]) {
+    fn product(&self, x: &[f32], rhs: &Right, bias: &[f32], out: &mut [f32]) {
         let (size, lhs) = ([x.len() / self.inputs, self.outputs, self.inputs], (x, [1, self.inputs]));
         product(size, lhs, rhs, out, false);
-        if let Some(bias) = bias {
+        // An absent bias is one zero.
+        if bias.len() == self.outputs {
             add_to_rows(bias, out);
         }
     }

@@ -19,29 +19,12 @@ mod weights3x3;
 #[cfg(test)]
 mod tests;
 
-use std::fmt::Debug;
-
 use rayon::prelude::*;
-
-use crate::op::InputGradients;
 
 pub use attention::Attention;
 pub use convolution::Convolution;
 pub use linear::Linear;
 pub use norm::LayerNorm;
-
-/// A function of an input, a weight and an optional bias, with its gradients.
-pub trait Layer: Debug + Send + Sync + 'static {
-    /// Values that the backward pass needs beside the input and the weight.
-    type Kept: Send + 'static;
-
-    /// `given`: the input and the weight. `keep`: a backward pass will follow.
-    fn forward(&self, given: [&[f32]; 2], bias: Option<&[f32]>, keep: bool) -> (Vec<f32>, Self::Kept);
-
-    /// The wanted gradients of the input, the weight and the bias, from the input, the weight and the result's gradient.
-    /// Unwanted gradients cost nothing.
-    fn backward(&self, given: [&[f32]; 3], kept: Self::Kept, wanted: [bool; 3]) -> InputGradients;
-}
 
 /// The sum of parts of `len` values each, in the order of the parts.
 fn join<'a>(parts: impl Iterator<Item = &'a [f32]>, len: usize) -> Vec<f32> {

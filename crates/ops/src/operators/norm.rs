@@ -2,9 +2,9 @@
 
 use rayon::prelude::*;
 
-use super::{Layer, join, parts};
+use super::{join, parts};
 use crate::buffers::take;
-use crate::op::InputGradients;
+use crate::op::{Given, InputGradients, Kept, Kernel};
 use crate::vectors::vectorized;
 
 /// Rows per task.
@@ -24,23 +24,23 @@ pub struct LayerNorm {
 /// Mean and 1 / √(variance + epsilon) of a row.
 type Statistics = [f32; 2];
 
-impl Layer for LayerNorm {
-    type Kept = Vec<Statistics>;
-
-    /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]` and each row's statistics.
-    fn forward(&self, [x, weight]: [&[f32]; 2], bias: Option<&[f32]>, _keep: bool) -> (Vec<f32>, Self::Kept) {
-        let bias = bias.expect("the published norms have biases");
+impl Kernel for LayerNorm {
+    /// `x` `[rows, channels]`, `weight` and `bias` `[channels]` → `[rows, channels]`. Keeps each row's statistics.
+    fn forward(&self, [x, weight, bias]: [&[f32]; 3], keep: bool) -> (Vec<f32>, Kept) {
         let mut out = take(x.len());
         let mut statistics = vec![[0.0; 2]; x.len() / self.channels];
         let piece = ROWS * self.channels;
         let tasks = out.par_chunks_mut(piece).zip(x.par_chunks(piece)).zip(statistics.par_chunks_mut(ROWS));
         tasks.for_each(|((out, x), statistics)| self.normalise(x, [weight, bias], out, statistics));
-        (out, statistics)
+        (out, keep.then(|| Box::new(statistics) as _))
     }
 
     /// If the gradient of weight or bias is wanted, both are computed.
-    fn backward(&self, given: [&[f32]; 3], statistics: Self::Kept, wanted: [bool; 3]) -> InputGradients {
-        let ([x, weight, dy], [of_input, of_weight, of_bias]) = (given, wanted);
+    fn backward(&self, given: Given) -> InputGradients {
+        let Given { inputs: [x, weight, _], kept, upstream: dy, wanted: [of_input, of_weight, of_bias] } =
+            given;
+        let kept = kept.and_then(|kept| kept.downcast::<Vec<Statistics>>().ok());
+        let statistics = kept.expect("kept by the forward pass");
         let (c, piece) = (self.channels, ROWS * self.channels);
         let blocks = statistics.len().div_ceil(ROWS);
         let summed = of_weight || of_bias;

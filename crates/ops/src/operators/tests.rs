@@ -2,6 +2,7 @@
 //! overhang, and single rows.
 
 use super::*;
+use crate::op::{Given, Kernel};
 use crate::rotary::plain_attention;
 use crate::testing::{assert_equal, relative_error, tensor, uniform as random, values, wide};
 use crate::{Rope, bilinear, has_kernels, is_bf16, layers, linear_gelu, rotary_attention};
@@ -102,7 +103,8 @@ fn taps_that_see_nothing_have_no_gradient() {
     x[0] = 0.7;
     let mut dy = vec![0.0; 1024];
     dy[0] = 0.3;
-    let [_, weight, _] = conv.backward([&x, &[0.1; 9], &dy], (), [true; 3]);
+    let inputs: [&[f32]; 3] = [&x, &[0.1; 9], &[0.0]];
+    let [_, weight, _] = conv.backward(Given { inputs, kept: None, upstream: &dy, wanted: [true; 3] });
     let expected: Vec<f32> = (0..9).map(|tap| if tap == 4 { 0.7 * 0.3 } else { 0.0 }).collect();
     assert_eq!(weight, Some(expected));
 }
@@ -200,11 +202,12 @@ fn resizing_equals_burns() {
 
 /// Results and gradients of all operators, at sizes that need several tasks.
 fn everything(in_bf16: bool) -> Vec<Vec<f32>> {
-    fn add<L: Layer>(all: &mut Vec<Vec<f32>>, layer: &L, [x, weight, bias, dy]: [&[f32]; 4]) {
-        let (result, kept) = layer.forward([x, weight], Some(bias), true);
-        assert_eq!(layer.forward([x, weight], Some(bias), false).0, result);
+    fn add(all: &mut Vec<Vec<f32>>, kernel: &dyn Kernel, [x, y, z, upstream]: [&[f32]; 4]) {
+        let (inputs, wanted) = ([x, y, z], [true; 3]);
+        let (result, kept) = kernel.forward(inputs, true);
+        assert_eq!(kernel.forward(inputs, false).0, result);
         all.push(result);
-        all.extend(layer.backward([x, weight, dy], kept, [true; 3]).into_iter().flatten());
+        all.extend(kernel.backward(Given { inputs, kept, upstream, wanted }).into_iter().flatten());
     }
     let mut all = Vec::new();
     let (x, dy) = (random(2 * 40 * 30 * 50, 1), random(2 * 72 * 30 * 50, 2));
@@ -220,13 +223,10 @@ fn everything(in_bf16: bool) -> Vec<Vec<f32>> {
     add(&mut all, &linear, given);
     let norm = LayerNorm { channels: 80, epsilon: 1e-6 };
     add(&mut all, &norm, [&x, &weight[..80], &weight[..80], &dy[..x.len()]]);
-    let attention = Attention { batch, tokens: 150, heads: 2, head_dim: 8, in_bf16 };
-    let tables = [&dy[..150 * 8], &dy[150 * 8..][..150 * 8]];
+    let rope = [0, 1].map(|table| dy[table * 150 * 8..][..150 * 8].to_vec());
+    let attention = Attention { batch, tokens: 150, heads: 2, head_dim: 8, in_bf16, rope };
     let len = 2 * 150 * 16;
-    let tokens = [0, 1, 2].map(|part| &x[part * len..][..len]);
-    let (result, logarithms) = attention.forward(tokens, tables);
-    all.push(result);
-    all.extend(attention.backward(tokens, tables, &logarithms, &dy[..len]));
+    add(&mut all, &attention, [&x[..len], &x[len..2 * len], &x[2 * len..3 * len], &dy[..len]]);
     all
 }
 
@@ -246,10 +246,12 @@ fn the_number_of_threads_changes_no_bit() {
 fn only_wanted_gradients_are_found_and_they_are_the_same() {
     let conv = convolution([1, 3, 5, 6, 7]);
     let (x, weight, dy) = (random(3 * 42, 1), random(135, 2), random(5 * 42, 3));
-    let all = conv.backward([&x, &weight, &dy], (), [true; 3]);
+    let inputs: [&[f32]; 3] = [&x, &weight, &[0.0]];
+    let backward = |wanted| conv.backward(Given { inputs, kept: None, upstream: &dy, wanted });
+    let all = backward([true; 3]);
     for bits in 0..8 {
         let wanted = [1, 2, 4].map(|bit| bits & bit > 0);
-        let got = conv.backward([&x, &weight, &dy], (), wanted);
+        let got = backward(wanted);
         assert_eq!(got[0], all[0].clone().filter(|_| wanted[0]));
         assert_eq!(got[1], all[1].clone().filter(|_| wanted[1]));
         assert_eq!(got[2].is_some(), wanted[2]);
