@@ -4,16 +4,10 @@ use pulp::{Arch, Simd, WithSimd};
 
 /// Runs loops, a closure without arguments, with all vector instructions of this processor.
 macro_rules! vectorized {
-    (|| $loops:expr) => {
+    ($($loops:tt)+) => {
         $crate::vectors::run(
             #[inline(always)]
-            || $loops,
-        )
-    };
-    (move || $loops:expr) => {
-        $crate::vectors::run(
-            #[inline(always)]
-            move || $loops,
+            $($loops)+,
         )
     };
 }

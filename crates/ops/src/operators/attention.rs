@@ -5,6 +5,7 @@
 
 use rayon::prelude::*;
 
+use super::elements::LANES;
 use crate::buffers::{Floats, take};
 use crate::math::exp;
 use crate::multiply::{Matrix, Right, product};
@@ -163,9 +164,6 @@ fn rotate(x: &mut [f32], d: usize, rope: &[Vec<f32>; 2], factor: f32, sign: f32)
         }
     });
 }
-
-/// Independent accumulators of a reduction, as many as the widest vector has lanes.
-const LANES: usize = 16;
 
 /// Replaces scores by e^(score − row's maximum), and writes ln Σ e^score per row. Returns the sums of the new rows.
 fn exponentials(scores: &mut [f32], keys: usize, logarithms: &mut [f32]) -> Vec<f32> {

@@ -4,6 +4,10 @@
 use rayon::prelude::*;
 
 use crate::vectors::vectorized;
+use crate::winograd::planes::keep_positive;
+
+/// Independent accumulators of a reduction, as many as the widest vector has lanes.
+pub const LANES: usize = 16;
 
 /// out = max(x, 0).
 pub fn rectify(x: &[f32], out: &mut [f32]) {
@@ -12,11 +16,7 @@ pub fn rectify(x: &[f32], out: &mut [f32]) {
 
 /// gradient = 0 where x is not positive.
 pub fn mask(x: &[f32], gradient: &mut [f32]) {
-    vectorized!(|| {
-        for (gradient, x) in gradient.iter_mut().zip(x) {
-            *gradient = if *x > 0.0 { *gradient } else { 0.0 };
-        }
-    });
+    vectorized!(|| keep_positive(gradient, x));
 }
 
 /// out = x + y.
@@ -42,16 +42,25 @@ pub fn add_to_rows(row: &[f32], rows: &mut [f32]) {
     });
 }
 
-/// The sum of the values, as sixteen interleaved sums.
-pub fn total(values: &[f32]) -> f32 {
-    vectorized!(|| {
-        let (chunks, rest) = values.as_chunks::<16>();
-        let mut sums = [0.0_f32; 16];
-        for chunk in chunks {
-            sums.iter_mut().zip(chunk).for_each(|(sum, x)| *sum += x);
+/// The sum of f over all positions of the slices, as sixteen interleaved sums.
+#[inline(always)]
+pub fn sum<const N: usize>(slices: [&[f32]; N], f: impl Fn([f32; N]) -> f32) -> f32 {
+    let whole = slices[0].len() / LANES * LANES;
+    let mut sums = [0.0; LANES];
+    let chunks = slices.map(|slice| slice.as_chunks::<LANES>().0);
+    for i in 0..whole / LANES {
+        let chunk = chunks.map(|chunks| &chunks[i]);
+        for lane in 0..LANES {
+            sums[lane] += f(chunk.map(|chunk| chunk[lane]));
         }
-        sums.iter().sum::<f32>() + rest.iter().sum::<f32>()
-    })
+    }
+    let rest = (whole..slices[0].len()).map(|i| f(slices.map(|slice| slice[i])));
+    sums.into_iter().sum::<f32>() + rest.sum::<f32>()
+}
+
+/// The sum of the values.
+pub fn total(values: &[f32]) -> f32 {
+    vectorized!(|| sum([values], |[x]| x))
 }
 
 /// Sums of every channel over the pixels of all images `[batch, channels, pixels]`: the gradient of a bias.

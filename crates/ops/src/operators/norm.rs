@@ -2,6 +2,7 @@
 
 use rayon::prelude::*;
 
+use super::elements::sum;
 use super::{join, parts};
 use crate::buffers::take;
 use crate::op::{Given, InputGradients, Kept, Kernel};
@@ -9,8 +10,6 @@ use crate::vectors::vectorized;
 
 /// Rows per task.
 const ROWS: usize = 64;
-/// Independent accumulators of a sum, as many as the widest vector has lanes.
-const LANES: usize = 16;
 
 /// (x − mean) / √(variance + epsilon) · weight + bias over the channels of every row.
 #[derive(Debug, Clone, Copy)]
@@ -62,22 +61,6 @@ impl Kernel for LayerNorm {
         joined.truncate(c);
         [dx, of_weight.then_some(joined), bias]
     }
-}
-
-/// The sum of f over all positions of the slices, as sixteen interleaved sums.
-#[inline(always)]
-fn sum<const N: usize>(slices: [&[f32]; N], f: impl Fn([f32; N]) -> f32) -> f32 {
-    let whole = slices[0].len() / LANES * LANES;
-    let mut sums = [0.0; LANES];
-    let chunks = slices.map(|slice| slice.as_chunks::<LANES>().0);
-    for i in 0..whole / LANES {
-        let chunk = chunks.map(|chunks| &chunks[i]);
-        for lane in 0..LANES {
-            sums[lane] += f(chunk.map(|chunk| chunk[lane]));
-        }
-    }
-    let rest = (whole..slices[0].len()).map(|i| f(slices.map(|slice| slice[i])));
-    sums.into_iter().sum::<f32>() + rest.sum::<f32>()
 }
 
 impl LayerNorm {

@@ -212,7 +212,7 @@ impl WithSimd for Scatter<'_, '_> {
 
 /// values = 0 where x is not positive.
 #[inline(always)]
-fn keep_positive(values: &mut [f32], x: &[f32]) {
+pub fn keep_positive(values: &mut [f32], x: &[f32]) {
     for (value, x) in values.iter_mut().zip(x) {
         *value = if *x > 0.0 { *value } else { 0.0 };
     }
