@@ -5,13 +5,14 @@
 use std::arch::x86_64::{
     __m512, __m512bh, __m512i, _mm512_cvtepu16_epi32, _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh,
     _mm512_dpbf16_ps, _mm512_or_si512, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_setzero_si512,
-    _mm512_shuffle_i32x4, _mm512_slli_epi32, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64,
-    _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
+    _mm512_slli_epi32,
 };
 
 use pulp::cast;
+use pulp::core_arch::x86::Avx512f;
 
 use super::{BLOCK, Columns, PAIRS, PANEL, Row, Source, Sums};
+use crate::winograd::planes::shuffled;
 
 /// Whether this processor has the instructions of all functions of this file.
 #[inline]
@@ -132,7 +133,8 @@ fn square(source: &Source, first: usize, k: usize, by_row: bool) -> [__m512i; PA
         }
     }
     if along_rows == by_row {
-        transpose(&mut square);
+        let simd = Avx512f::try_new().expect("this processor computes in bf16");
+        square = cast(shuffled(simd, cast(square)));
     }
     square
 }
@@ -167,28 +169,4 @@ fn interleaved(a: __m512, b: __m512) -> __m512i {
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
 fn consecutive(a: __m512, b: __m512) -> __m512i {
     cast(_mm512_cvtne2ps_pbh(b, a))
-}
-
-/// Transposes in four rounds of shuffles: of words, of pairs of words, of quarters and of halves.
-#[inline]
-#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-fn transpose(rows: &mut [__m512i; PAIRS]) {
-    for i in (0..PAIRS).step_by(2) {
-        let (a, b) = (rows[i], rows[i + 1]);
-        (rows[i], rows[i + 1]) = (_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
-    }
-    for i in (0..PAIRS).step_by(4) {
-        let [a, b, c, d] = [rows[i], rows[i + 1], rows[i + 2], rows[i + 3]];
-        (rows[i], rows[i + 1]) = (_mm512_unpacklo_epi64(a, c), _mm512_unpackhi_epi64(a, c));
-        (rows[i + 2], rows[i + 3]) = (_mm512_unpacklo_epi64(b, d), _mm512_unpackhi_epi64(b, d));
-    }
-    for distance in [4, 8] {
-        for i in 0..PAIRS {
-            if i & distance == 0 {
-                let (a, b) = (rows[i], rows[i + distance]);
-                rows[i] = _mm512_shuffle_i32x4::<0x88>(a, b);
-                rows[i + distance] = _mm512_shuffle_i32x4::<0xdd>(a, b);
-            }
-        }
-    }
 }

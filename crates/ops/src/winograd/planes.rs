@@ -14,7 +14,7 @@ type Square = [[f32; GROUP]; GROUP];
 fn transposed<S: Simd>(simd: S, square: Square) -> Square {
     #[cfg(target_arch = "x86_64")]
     if let Some(simd) = (&simd as &dyn std::any::Any).downcast_ref::<pulp::x86::V4>() {
-        return shuffled(*simd, square);
+        return shuffled(simd.avx512f, square);
     }
     std::array::from_fn(|i| std::array::from_fn(|j| square[j][i]))
 }
@@ -24,9 +24,8 @@ fn transposed<S: Simd>(simd: S, square: Square) -> Square {
 /// Loops, because closures of `array::from_fn` are not compiled for the target's features.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-fn shuffled(simd: pulp::x86::V4, square: Square) -> Square {
+pub fn shuffled(f: pulp::core_arch::x86::Avx512f, square: Square) -> Square {
     use std::arch::x86_64::{__m512, __m512d};
-    let f = simd.avx512f;
     let mut rows: [__m512; GROUP] = pulp::cast(square);
     for i in (0..GROUP).step_by(2) {
         let (a, b) = (rows[i], rows[i + 1]);
