@@ -62,7 +62,12 @@ fn normal(x: f32) -> [f32; 2] {
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::FRAC_1_SQRT_2;
+
+    use burn::tensor::{Device, FloatDType, Tensor, TensorData};
+
     use super::*;
+    use crate::testing::values;
 
     fn sweep() -> impl Iterator<Item = f32> {
         (-870_000..=870_000).map(|i| i as f32 * 1e-4)
@@ -78,57 +83,34 @@ mod tests {
         assert!(worst < 3e-7, "{worst:e}");
     }
 
-    /// The reference Φ is 20,000 steps of Simpson's rule over the normal density.
+    /// Against the error function in f64, and Burn's derivative of it.
     #[test]
-    fn gelu_is_accurate_to_its_bound() {
-        let phi = |x: f64| {
-            let density = |u: f64| (-0.5 * u * u).exp() / (2.0 * std::f64::consts::PI).sqrt();
-            let (n, h) = (20_000, x / 20_000.0);
-            let inner: f64 =
-                (1..n).map(|i| density(f64::from(i) * h) * if i % 2 == 1 { 4.0 } else { 2.0 }).sum();
-            0.5 + h / 3.0 * (density(0.0) + inner + density(x))
-        };
-        for i in -80..=80 {
-            let x = i as f32 * 0.1;
-            let expected = f64::from(x) * phi(f64::from(x));
+    fn gelu_and_its_derivative_are_accurate_to_their_bounds() {
+        let grid: Vec<f32> = (-80..=80).map(|i| i as f32 * 0.1).collect();
+        let data = TensorData::new(grid.clone(), [grid.len()]);
+        let x = Tensor::<1>::from_data(data, &Device::flex().autodiff()).cast(FloatDType::F64).require_grad();
+        let expected = x.clone() * ((x.clone() * FRAC_1_SQRT_2).erf() + 1.0) * 0.5;
+        let slopes = x.grad(&expected.clone().sum().backward()).expect("tracked");
+        for ((x, expected), slope) in grid.into_iter().zip(values(expected)).zip(values(slopes)) {
             let error = (f64::from(gelu(x)) - expected).abs();
             // 1.5e-7 times at most |x|, plus f32 rounding of the result.
             assert!(error <= 3e-7 * f64::from(x.abs()).max(0.1), "gelu({x}): {error:e}");
+            let error = (f64::from(gelu_derivative(x)) - slope).abs();
+            assert!(error <= 1e-6, "gelu'({x}): {error:e}");
         }
     }
 
     #[test]
-    fn the_slope_of_silu_is_accurate_to_rounding() {
+    fn silu_and_its_slope_are_accurate_to_rounding() {
         for x in sweep() {
             let sigmoid = (1.0 + (-f64::from(x)).exp()).recip();
-            let expected = [f64::from(x) * sigmoid, sigmoid * (1.0 + f64::from(x) * (1.0 - sigmoid))];
-            let got = silu_and_slope(x);
-            for (got, expected) in got.into_iter().zip(expected) {
+            let (value, slope) = (f64::from(x) * sigmoid, sigmoid * (1.0 + f64::from(x) * (1.0 - sigmoid)));
+            let got = silu_and_slope(x).into_iter().chain([silu(x)]);
+            for (got, expected) in got.zip([value, slope, value]) {
                 // The 3e-7 of `exp` and three roundings of terms up to max(1, |x|).
                 let error = (f64::from(got) - expected).abs();
                 assert!(error <= 1e-6 * f64::from(x.abs()).max(1.0), "x = {x}: {error:e}");
             }
         }
-    }
-
-    /// Against central differences of `gelu`, whose step is wide enough for its rounding.
-    #[test]
-    fn gelu_derivative_is_the_slope() {
-        for i in -80..=80 {
-            let (x, h) = (i as f32 * 0.1, 0.01);
-            let slope =
-                (f64::from(gelu(x + h)) - f64::from(gelu(x - h))) / (f64::from(x + h) - f64::from(x - h));
-            // h² / 6 times the third derivative (at most 1.2), and GELU's own error over 2·h.
-            let error = (f64::from(gelu_derivative(x)) - slope).abs();
-            assert!(error < 6e-5 + 3e-5 * f64::from(x.abs()), "gelu'({x}): {error:e}");
-        }
-    }
-
-    #[test]
-    fn silu_has_its_limits() {
-        assert_eq!(silu(0.0), 0.0);
-        assert!((silu(1.0) - 0.731_058_6).abs() < 1e-6);
-        assert_eq!(silu(100.0), 100.0);
-        assert!(silu(-100.0).abs() < 1e-30);
     }
 }

@@ -65,8 +65,10 @@ fn flushed(value: f32) -> f32 {
 
 #[cfg(test)]
 mod tests {
+    use burn::tensor::{Device, FloatDType, Tensor, TensorData};
+
     use super::*;
-    use crate::testing::{relative_error, uniform, wide};
+    use crate::testing::{relative_error, uniform, values, wide};
 
     #[test]
     fn zeros_stay_zeros() {
@@ -81,22 +83,15 @@ mod tests {
             let matrix: Vec<f32> =
                 noise.iter().enumerate().map(|(i, x)| x * 0.5_f32.powi((i / columns) as i32)).collect();
             let norm = matrix.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt();
-            let mut x: Vec<f64> = matrix.iter().map(|x| f64::from(*x) / norm).collect();
-            let product =
-                |lhs: &[f64], rhs: &dyn Fn(usize, usize) -> f64, inner: usize, width: usize| -> Vec<f64> {
-                    let sum =
-                        |i: usize| (0..inner).map(|k| lhs[i / width * inner + k] * rhs(k, i % width)).sum();
-                    (0..lhs.len() / inner * width).map(sum).collect()
-                };
+            let data = TensorData::new(matrix.clone(), [rows, columns]);
+            let mut x = Tensor::<2>::from_data(data, &Device::flex()).cast(FloatDType::F64) / norm;
             let [a, b, c] = COEFFICIENTS.map(f64::from);
             for _ in 0..STEPS {
-                let gram = product(&x, &|k, j| x[j * columns + k], columns, rows);
-                let square = product(&gram, &|k, j| gram[k * rows + j], rows, rows);
-                let correction: Vec<f64> = gram.iter().zip(&square).map(|(g, s)| b * g + c * s).collect();
-                let next = product(&correction, &|k, j| x[k * columns + j], rows, columns);
-                x.iter_mut().zip(next).for_each(|(x, next)| *x = a * *x + next);
+                let gram = x.clone().matmul(x.clone().transpose());
+                let correction = gram.clone() * b + gram.clone().matmul(gram) * c;
+                x = x.clone() * a + correction.matmul(x);
             }
-            let error = relative_error(&wide(&orthogonalised(matrix, [rows, columns])), &x);
+            let error = relative_error(&wide(&orthogonalised(matrix, [rows, columns])), &values(x));
             println!("{rows}x{columns}: {error:e}");
             assert!(error < 2e-3, "{rows}x{columns}: {error:e}");
         }
