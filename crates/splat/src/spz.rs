@@ -12,7 +12,7 @@ use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 
-use crate::stored::{COEFFICIENTS, Problem, Stored, check_ratio, unit};
+use crate::stored::{COEFFICIENTS, Problem, Stored, check_ratio, logit, unit};
 
 /// First bytes of a gzip stream.
 pub(crate) const GZIP: [u8; 2] = [0x1f, 0x8b];
@@ -136,7 +136,9 @@ fn columns(
             columns.push(fixed.chunks_exact(9).map(value).collect());
         }
     }
-    let opacities: Vec<f32> = take(n, "opacities")?.iter().map(|&a| logit(a)).collect();
+    // The first and the last step move inwards by a quarter step, to be finite.
+    let logit = |step: &u8| logit(f32::from(*step).clamp(0.25, 254.75) / 255.0);
+    let opacities: Vec<f32> = take(n, "opacities")?.iter().map(logit).collect();
     let colors = take(3 * n, "colours")?;
     let scales = take(3 * n, "scales")?;
     let rotations = take(size * n, "rotations")?;
@@ -290,12 +292,6 @@ fn damaged(e: io::Error) -> Problem {
 /// The nearest byte; 0 for NaN.
 fn byte(value: f32) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
-}
-
-/// Logit of an opacity in 255 steps. The first and the last step move inwards by a quarter step, to be finite.
-fn logit(alpha: u8) -> f32 {
-    let opacity = f32::from(alpha).clamp(0.25, 254.75) / 255.0;
-    (opacity / (1.0 - opacity)).ln()
 }
 
 /// The byte of a coefficient, rounded to a multiple of `step`.

@@ -233,6 +233,16 @@ pub(crate) fn unit(q: [f32; 4]) -> [f32; 4] {
     if length > 0.0 { q.map(|v| (f64::from(v) / length) as f32) } else { [1.0, 0.0, 0.0, 0.0] }
 }
 
+/// A quaternion (w, x, y, z) without its largest component, from the places of the others in the range of ±√½.
+pub(crate) fn smallest_three(largest: usize, places: [f32; 3]) -> [f32; 4] {
+    let mut q = [0.0_f32; 4];
+    for (i, place) in (0..4).filter(|i| *i != largest).zip(places) {
+        q[i] = (place - 0.5) * std::f32::consts::SQRT_2;
+    }
+    q[largest] = (1.0 - q.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+    q
+}
+
 /// The opacity of a logit.
 pub(crate) fn opacity(logit: f32) -> f32 {
     1.0 / (1.0 + (-logit).exp())

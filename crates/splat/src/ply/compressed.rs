@@ -6,7 +6,7 @@ use std::io::BufRead;
 use super::body::Body;
 use super::header::{Element, Header};
 use crate::sh;
-use crate::stored::{COEFFICIENTS, Problem, Stored, logit};
+use crate::stored::{COEFFICIENTS, Problem, Stored, logit, smallest_three};
 
 /// Gaussians of a chunk.
 const CHUNK: usize = 256;
@@ -95,7 +95,7 @@ pub(super) fn read(header: &Header, mut body: Body<impl BufRead>) -> Result<Stor
         let rgb = [0, 1, 2].map(|c| (ranged(i, 6 + c, color[c]) - 0.5) / sh::C0);
         let centre = [0, 1, 2].map(|axis| ranged(i, axis, centre[axis]));
         let scale = [0, 1, 2].map(|axis| ranged(i, 3 + axis, scale[axis]));
-        let all = centre.into_iter().chain(smallest_three(word(row, 1))).chain(scale);
+        let all = centre.into_iter().chain(rotation(word(row, 1))).chain(scale);
         let all = all.chain([logit(color[3])]).chain(rgb);
         columns.iter_mut().zip(all).for_each(|(column, value)| column.push(value));
     }
@@ -125,12 +125,6 @@ fn eleven_ten_eleven(word: u32) -> [f32; 3] {
 }
 
 /// A quaternion (w, x, y, z): the index of the largest component, and the others in ten bits each.
-fn smallest_three(word: u32) -> [f32; 4] {
-    let largest = (word >> 30) as usize;
-    let mut q = [0.0_f32; 4];
-    for (i, shift) in (0..4).filter(|i| *i != largest).zip([20, 10, 0]) {
-        q[i] = ((word >> shift & 1023) as f32 / 1023.0 - 0.5) * std::f32::consts::SQRT_2;
-    }
-    q[largest] = (1.0 - q.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
-    q
+fn rotation(word: u32) -> [f32; 4] {
+    smallest_three((word >> 30) as usize, [20, 10, 0].map(|shift| (word >> shift & 1023) as f32 / 1023.0))
 }

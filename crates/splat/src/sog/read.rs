@@ -8,7 +8,7 @@ use serde_json::Value;
 use zip::ZipArchive;
 
 use super::{FIRST_LEFT_OUT, MAX_SIDE};
-use crate::stored::{COEFFICIENTS, Problem, Stored, check_ratio, logit};
+use crate::stored::{COEFFICIENTS, Problem, Stored, check_ratio, logit, smallest_three};
 
 /// Largest `meta.json` in bytes.
 const MAX_META: u64 = 1 << 20;
@@ -68,7 +68,9 @@ pub(crate) fn read(mut input: impl Read, length: u64) -> Result<Stored, Problem>
         columns.push(low.pixels().zip(high.pixels()).take(count).map(value).collect());
     }
     let turned = quats.pixels().take(count).map(|pixel| {
-        let [w, x, y, z] = unpack_smallest_three(pixel.0);
+        let [a, b, c, left_out] = pixel.0;
+        let largest = usize::from(left_out.saturating_sub(FIRST_LEFT_OUT));
+        let [w, x, y, z] = smallest_three(largest, [a, b, c].map(|byte| f32::from(byte) / 255.0));
         // The quaternion of the turn back, −k, times (w, x, y, z).
         [z, y, -x, -w]
     });
@@ -133,16 +135,4 @@ fn numbers(value: &Value, count: usize, part: &str) -> Result<Vec<f32>, Problem>
     let numbers = list.and_then(|list| list.iter().map(|v| v.as_f64().map(|v| v as f32)).collect());
     let numbers = numbers.filter(|numbers: &Vec<f32>| numbers.iter().all(|v| v.is_finite()));
     numbers.ok_or_else(|| format!("meta.json: `{part}` lacks its {count} numbers").into())
-}
-
-/// A quaternion (w, x, y, z): the inverse of [`super::pack_smallest_three`].
-fn unpack_smallest_three([a, b, c, left_out]: [u8; 4]) -> [f32; 4] {
-    let mut q = [0.0_f32; 4];
-    let largest = usize::from(left_out.saturating_sub(FIRST_LEFT_OUT));
-    let others = (0..4).filter(|i| *i != largest);
-    for (i, byte) in others.zip([a, b, c]) {
-        q[i] = (f32::from(byte) / 255.0 - 0.5) * std::f32::consts::SQRT_2;
-    }
-    q[largest] = (1.0 - q.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
-    q
 }
