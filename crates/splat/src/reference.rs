@@ -253,13 +253,7 @@ fn splat<T: Number>(index: usize, g: &[T; 14], camera: &Camera, options: &Render
     let clamped = |ratio: T, side: u32, focal: f64, principal: f64| {
         let side = f64::from(side);
         let (low, high) = ((-principal - 0.15 * side) / focal, (side - principal + 0.15 * side) / focal);
-        if ratio.value() < low {
-            n(low)
-        } else if ratio.value() > high {
-            n(high)
-        } else {
-            ratio
-        }
+        if (low..=high).contains(&ratio.value()) { ratio } else { n(ratio.value().clamp(low, high)) }
     };
     let (f, c) = (camera.focal, camera.principal_point);
     let ratio_x = clamped(t[0] / t[2], camera.width, f.x, c.x);

@@ -37,8 +37,9 @@ fn of_splatting(entry: &Value) -> Result<Camera, String> {
     let [fx, fy] = ["fx", "fy"].map(|name| entry[name].as_f64());
     let focal = DVec2::new(fx.ok_or("`fx` is missing")?, fy.ok_or("`fy` is missing")?);
     let principal_point = DVec2::new(f64::from(width), f64::from(height)) / 2.0;
-    let to_world = DMat3::from_cols_array_2d(&rows).transpose();
-    Ok(Camera { width, height, focal, principal_point, world_to_camera: at(to_world, position.into()) })
+    let rotation = DMat3::from_cols_array_2d(&rows).transpose();
+    let world_to_camera = RigidTransform { rotation, translation: position.into() }.inverse();
+    Ok(Camera { width, height, focal, principal_point, world_to_camera })
 }
 
 /// `transform_matrix` of a camera in the world, with OpenGL axes. The lens is told once or by frame, in pixels or as an
@@ -65,20 +66,14 @@ fn of_radiance_field(root: &Value, frame: &Value, size: Option<[u32; 2]>) -> Res
     let matrix = <Vec<[f64; 4]>>::deserialize(&frame["transform_matrix"]).ok();
     let matrix = matrix.filter(|rows| rows.len() >= 3).ok_or("`transform_matrix` is no 4 × 4 matrix")?;
     let column = |i: usize| DVec3::new(matrix[0][i], matrix[1][i], matrix[2][i]);
-    let to_world = DMat3::from_cols(column(0), -column(1), -column(2));
+    let rotation = DMat3::from_cols(column(0), -column(1), -column(2));
     Ok(Camera {
         width,
         height,
         focal: DVec2::new(fx, fy),
         principal_point: DVec2::new(middle("cx", width), middle("cy", height)),
-        world_to_camera: at(to_world, column(3)),
+        world_to_camera: RigidTransform { rotation, translation: column(3) }.inverse(),
     })
-}
-
-/// The transform of a camera with this turn to the world at a place.
-fn at(to_world: DMat3, place: DVec3) -> RigidTransform {
-    let rotation = to_world.transpose();
-    RigidTransform { rotation, translation: -(rotation * place) }
 }
 
 /// A whole number of pixels. Some programs write it as a fraction.

@@ -40,13 +40,8 @@ impl<T> Inputs<T> {
 
     /// Applies `f` to each value and the value of `other` for the same input.
     pub fn with<U, R>(self, other: Inputs<U>, mut f: impl FnMut(T, U) -> R) -> Inputs<R> {
-        Inputs {
-            means: f(self.means, other.means),
-            rotations: f(self.rotations, other.rotations),
-            scales: f(self.scales, other.scales),
-            opacities: f(self.opacities, other.opacities),
-            colors: f(self.colors, other.colors),
-        }
+        let mut others = other.into_array().into_iter();
+        self.map(|value| f(value, others.next().expect("as many of them")))
     }
 }
 
