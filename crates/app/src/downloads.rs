@@ -18,8 +18,6 @@ use crate::turntable;
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Download {
     Gaussians(Kind),
-    /// A PLY with y down.
-    YDown,
     Mesh,
     Turntable,
 }
@@ -27,7 +25,7 @@ pub enum Download {
 /// Paths of the files behind `scene.`, which are also their extensions.
 const FILES: [(&str, Download); 7] = [
     ("ply", Download::Gaussians(Kind::Ply)),
-    ("y-down.ply", Download::YDown),
+    ("y-down.ply", Download::Gaussians(Kind::YDown)),
     ("spz", Download::Gaussians(Kind::Spz)),
     ("sog", Download::Gaussians(Kind::Sog)),
     ("gaussians.glb", Download::Gaussians(Kind::Glb)),
@@ -51,7 +49,6 @@ impl Download {
     pub fn make(self, stored: &Stored, step: &dyn Fn(&str)) -> Result<Vec<u8>, Failure> {
         match self {
             Self::Gaussians(kind) => Ok(stored.to_bytes(kind)?),
-            Self::YDown => Ok(stored.to_bytes_y_down()?),
             Self::Mesh => {
                 let fused = fuse(&stored.load(&Device::flex()), mesh::options(MeshKind::Glb), step)?;
                 export::glb_bytes(&fused.mesh, None).map_err(|e| Failure::Internal(e.to_string()))

@@ -72,7 +72,7 @@ pub fn write(py: Python<'_>, path: PathBuf, arrays: Arrays, y_down: bool) -> PyR
             return Err(unsuitable("y_down", "is for PLYs: viewers know the axes of other files"));
         }
         let stored = Stored::of(&gaussians(&arrays, &Device::flex())?)?;
-        Ok(if y_down { stored.write_y_down(&path) } else { stored.write(&path) }?)
+        Ok(stored.write(if y_down { Kind::YDown } else { kind }, &path)?)
     })
 }
 

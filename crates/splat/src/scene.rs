@@ -19,6 +19,9 @@ const ZIP: [u8; 2] = *b"PK";
 pub enum Kind {
     /// 3D Gaussian PLY in the layout of the INRIA viewer.
     Ply,
+    /// A PLY whose world has y down, for viewers that expect the axes of INRIA's scenes. By a comment in the header,
+    /// [`Stored::read`] recognises the file and turns the Gaussians back.
+    YDown,
     /// Niantic's compressed splats.
     Spz,
     /// Binary glTF with the extension `KHR_gaussian_splatting`.
@@ -78,45 +81,14 @@ impl Stored {
         Ok(read)
     }
 
-    /// Writes a file of the kind of `path`'s extension, whole or not at all.
+    /// Writes a file of this kind, whole or not at all.
     ///
     /// # Errors
     /// [`SplatError::NotFinite`]; [`SplatError::File`] for values that an SPZ, GLB or SOG cannot hold, or if the file
     /// cannot be written. `path` is then left as it was.
-    pub fn write(&self, path: &Path) -> Result<(), SplatError> {
-        let kind = Kind::of(path);
+    pub fn write(&self, kind: Kind, path: &Path) -> Result<(), SplatError> {
         self.check(kind, path)?;
         Ok(file::write_whole(path, |out| self.encode(kind, out)).map_err(FileError::write(path))?)
-    }
-
-    /// Writes a PLY whose world has y down, whole or not at all, for viewers that expect the axes of INRIA's scenes.
-    /// By a comment in the header, [`Stored::read`] recognises the file and turns the Gaussians back.
-    ///
-    /// # Errors
-    /// As [`Self::write`].
-    pub fn write_y_down(&self, path: &Path) -> Result<(), SplatError> {
-        self.check(Kind::Ply, path)?;
-        let turned = self.with_y_down();
-        let written = file::write_whole(path, |out| ply::write(&turned, Some(ply::Y_DOWN), out));
-        Ok(written.map_err(FileError::write(path))?)
-    }
-
-    /// The bytes of [`Self::write_y_down`]'s file.
-    ///
-    /// # Errors
-    /// As [`Self::write`].
-    pub fn to_bytes_y_down(&self) -> Result<Vec<u8>, SplatError> {
-        let path = Path::new("memory");
-        self.check(Kind::Ply, path)?;
-        let mut bytes = Vec::new();
-        ply::write(&self.with_y_down(), Some(ply::Y_DOWN), &mut bytes).map_err(FileError::write(path))?;
-        Ok(bytes)
-    }
-
-    fn with_y_down(&self) -> Self {
-        let mut turned = self.clone();
-        turned.turn(false);
-        turned
     }
 
     /// The bytes of a file of this kind.
@@ -134,7 +106,7 @@ impl Stored {
     /// Losses beyond the usual quantisation of this kind of file, one sentence each.
     pub fn losses(&self, kind: Kind) -> Vec<String> {
         match kind {
-            Kind::Ply | Kind::Glb => Vec::new(),
+            Kind::Ply | Kind::YDown | Kind::Glb => Vec::new(),
             Kind::Spz => spz::losses(self),
             Kind::Sog => sog::losses(self),
         }
@@ -143,6 +115,11 @@ impl Stored {
     fn encode(&self, kind: Kind, out: &mut impl Write) -> io::Result<()> {
         match kind {
             Kind::Ply => ply::write(self, None, out),
+            Kind::YDown => {
+                let mut turned = self.clone();
+                turned.turn(false);
+                ply::write(&turned, Some(ply::Y_DOWN), out)
+            }
             Kind::Spz => spz::write(self, out),
             Kind::Glb => glb::write(self, out),
             Kind::Sog => sog::write(self, out),
@@ -157,7 +134,7 @@ impl Stored {
             }
         }
         let checked = match kind {
-            Kind::Ply => Ok(()),
+            Kind::Ply | Kind::YDown => Ok(()),
             Kind::Spz => spz::check(self),
             Kind::Glb => glb::check(self),
             Kind::Sog => sog::check(self),
@@ -174,10 +151,10 @@ pub fn read(path: &Path, device: &Device) -> Result<Loaded, SplatError> {
     Ok(Stored::read(path)?.load(device))
 }
 
-/// Writes `gaussians`: [`Stored::of`], then [`Stored::write`].
+/// Writes `gaussians`: [`Stored::of`], then [`Stored::write`] with the kind of `path`'s extension.
 ///
 /// # Errors
 /// As [`Stored::of`] and [`Stored::write`]; `path` is then left as it was.
 pub fn write(gaussians: &Gaussians, path: &Path) -> Result<(), SplatError> {
-    Stored::of(gaussians)?.write(path)
+    Stored::of(gaussians)?.write(Kind::of(path), path)
 }

@@ -47,7 +47,7 @@ impl AxesArguments {
 
     /// Writes the file, whole or not at all.
     pub fn write(&self, stored: &Stored, output: &Path) -> Result<(), Failure> {
-        Ok(if self.y_down { stored.write_y_down(output) } else { stored.write(output) }?)
+        Ok(stored.write(if self.y_down { Kind::YDown } else { Kind::of(output) }, output)?)
     }
 }
 
