@@ -216,39 +216,3 @@ pub fn keep_positive(values: &mut [f32], x: &[f32]) {
         *value = if *x > 0.0 { *value } else { 0.0 };
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// 35 channels of 7 × 21 pixels to groups and back.
-    fn groups_and_back<S: Simd>(simd: S) {
-        let (channels, height, width) = (35, 7, 21);
-        let plane = height * width;
-        let data: Vec<f32> = (0..channels * plane).map(|i| i as f32 - 2000.0).collect();
-        for rectified in [false, true] {
-            let planes = Planes { data: &data, height, width, rectified };
-            let mut out = vec![0.0; channels * plane];
-            for (group, out) in out.chunks_mut(GROUP * plane).enumerate() {
-                let mut pixels = vec![f32::NAN; plane * GROUP];
-                for (row, pixels) in pixels.chunks_exact_mut(width * GROUP).enumerate() {
-                    planes.read(simd, group, Some(row), 0, pixels);
-                }
-                let mask = rectified.then(|| (&data[group * GROUP * plane..], plane));
-                let mut slices: Vec<_> = out.chunks_exact_mut(plane).collect();
-                simd.vectorize(Scatter { pixels: &pixels, planes: &mut slices, mask });
-            }
-            let expected: Vec<f32> = data.iter().map(|x| if rectified { x.max(0.0) } else { *x }).collect();
-            assert_eq!(out, expected);
-        }
-    }
-
-    #[test]
-    fn planes_become_groups_and_groups_become_planes() {
-        groups_and_back(pulp::Scalar);
-        #[cfg(target_arch = "x86_64")]
-        if let Some(simd) = pulp::x86::V4::try_new() {
-            groups_and_back(simd);
-        }
-    }
-}

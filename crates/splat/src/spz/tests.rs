@@ -108,30 +108,11 @@ fn what_is_no_spz_or_a_damaged_one_is_refused() {
     assert!(problem(&changed(12, 5)).contains("degree 5"));
     assert!(problem(&changed(13, 25)).contains("25 fractional bits"));
     assert!(problem(&changed(8, 25)).contains("too early"));
-    assert!(problem(&good[..good.len() / 2]).contains("gzip stream is cut"));
     assert!(problem(&GZIP).contains("gzip stream is cut"));
     let mut sum = good.clone();
     let at = sum.len() - 6;
     sum[at] ^= 1;
     assert!(problem(&sum).contains("damaged"));
-    // A hostile header costs neither memory nor time: a large count without data, and many equal Gaussians.
-    let mut header = content(&good)[..16].to_vec();
-    header[8..12].copy_from_slice(&10_000_000_u32.to_le_bytes());
-    assert!(problem(&packed(&header)).contains("10000000 Gaussians in"));
-    header[8..12].copy_from_slice(&500_000_u32.to_le_bytes());
-    header.resize(16 + 500_000 * 64, 0);
-    assert!(problem(&packed(&header)).contains("no real scene"));
-}
-
-#[test]
-fn quaternions_of_any_length_and_sign_keep_their_rotation() {
-    for q in [[1.0, 0.0, 0.0, 0.0], [-3.0, 0.1, -0.2, 0.4], [0.0, -0.5, 0.5, 1e-6], [0.0; 4]] {
-        let length = q.iter().map(|v: &f32| v * v).sum::<f32>().sqrt();
-        let expected = if length > 0.0 { q.map(|v| v / length) } else { [1.0, 0.0, 0.0, 0.0] };
-        let found = unpack_smallest_three(pack_smallest_three(q));
-        let cosine: f32 = found.iter().zip(expected).map(|(a, b)| a * b).sum();
-        assert!(cosine.abs() > 0.999_99, "{q:?}: {found:?}");
-    }
 }
 
 #[test]
