@@ -13,6 +13,7 @@ use super::weights::transpose;
 use super::{CHANNELS, Plane, Source};
 use crate::buffers::Floats;
 use crate::vectors::vectorized;
+use crate::winograd::pieces;
 
 /// Columns that are processed while they are in the first-level cache; a multiple of every kernel's block of pixels.
 const CHUNK: usize = 120;
@@ -93,13 +94,7 @@ impl Backward<'_> {
         let mut inputs: Vec<_> = (0..count).map(|_| Floats::new(plane.height * line)).collect();
         // Enough bands for many cores, and few rows at the borders that two bands compute.
         let band = (plane.height / 16).clamp(4, 16);
-        let mut outs: Vec<Vec<&mut [f32]>> =
-            (0..plane.height.div_ceil(band)).map(|_| Vec::with_capacity(inputs.len())).collect();
-        for input in &mut inputs {
-            for (outs, piece) in outs.iter_mut().zip(input.chunks_mut(band * line)) {
-                outs.push(piece);
-            }
-        }
+        let outs = pieces(inputs.iter_mut().map(|input| &mut input[..]), plane.height * line, band * line);
         let transposed = if self.wanted.input { transpose(self.weights) } else { Vec::new() };
         let run = |(i, outs): (usize, _)| {
             let rows = band * i..(band * (i + 1)).min(plane.height);

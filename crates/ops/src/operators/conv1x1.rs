@@ -115,8 +115,8 @@ impl Convolution {
             .map(|(image, first)| Block { image, first, count: piece.min(pixels - first), out: Vec::new() })
             .collect();
         if let Some((out, channels)) = out {
-            let slices =
-                out.chunks_exact_mut(channels * pixels).flat_map(|image| pieces(image, pixels, piece));
+            let images = out.chunks_exact_mut(channels * pixels);
+            let slices = images.flat_map(|image| pieces(image.chunks_exact_mut(pixels), pixels, piece));
             blocks.iter_mut().zip(slices).for_each(|(block, slices)| block.out = slices);
         }
         blocks

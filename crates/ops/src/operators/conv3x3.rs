@@ -81,8 +81,8 @@ impl Convolution {
             .zip(x.chunks_exact(self.inputs * plane))
             .enumerate()
             .flat_map(|(image, (out, x))| {
-                let bands = pieces(out, plane, band * TILE * width).into_iter().enumerate();
-                bands.map(move |(i, out)| (image, x, i * band, out))
+                let pieces = pieces(out.chunks_exact_mut(plane), plane, band * TILE * width);
+                pieces.into_iter().enumerate().map(move |(i, out)| (image, x, i * band, out))
             })
             .collect();
         tasks.into_par_iter().for_each(|(image, data, row, mut out)| {

@@ -30,7 +30,8 @@ impl Convolution {
             .chunks_exact_mut(outputs * rows * columns)
             .enumerate()
             .flat_map(|(image, out)| {
-                let bands = pieces(out, rows * columns, band * columns).into_iter().enumerate();
+                let planes = out.chunks_exact_mut(rows * columns);
+                let bands = pieces(planes, rows * columns, band * columns).into_iter().enumerate();
                 bands.map(move |(i, out)| (image, i * band, out))
             })
             .collect();
@@ -57,10 +58,8 @@ impl Convolution {
         let (plane, n) = (self.pixels(), rows * columns);
         let mut dx = of_input.then(|| take(x.len()));
         // Every task computes some input channels of all images.
-        let slices: Vec<Vec<&mut [f32]>> = match &mut dx {
-            Some(dx) => pieces(dx, inputs * plane, CHANNELS * plane),
-            None => (0..inputs.div_ceil(CHANNELS)).map(|_| Vec::new()).collect(),
-        };
+        let images = dx.iter_mut().flat_map(|dx| dx.chunks_exact_mut(inputs * plane));
+        let slices = pieces(images, inputs * plane, CHANNELS * plane);
         let task = |(block, mut dx): (usize, Vec<&mut [f32]>)| {
             let first = block * CHANNELS;
             let channels = CHANNELS.min(inputs - first);

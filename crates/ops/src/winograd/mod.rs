@@ -13,11 +13,15 @@ mod tests;
 /// Channels of a group.
 pub const GROUP: usize = 16;
 
-/// Cuts every plane of `plane` floats into pieces of `piece` floats (the last may be shorter). Returns, for each piece,
-/// the slices of all planes. So each task can write some rows of all channels.
-pub(crate) fn pieces(data: &mut [f32], plane: usize, piece: usize) -> Vec<Vec<&mut [f32]>> {
+/// Cuts planes of `plane` floats into pieces of `piece` floats (the last may be shorter). Returns, for each piece, the
+/// slices of all planes. So each task can write some rows of all channels.
+pub(crate) fn pieces<'a>(
+    planes: impl Iterator<Item = &'a mut [f32]>,
+    plane: usize,
+    piece: usize,
+) -> Vec<Vec<&'a mut [f32]>> {
     let mut pieces: Vec<Vec<&mut [f32]>> = (0..plane.div_ceil(piece)).map(|_| Vec::new()).collect();
-    for plane in data.chunks_exact_mut(plane) {
+    for plane in planes {
         for (slices, slice) in pieces.iter_mut().zip(plane.chunks_mut(piece)) {
             slices.push(slice);
         }
