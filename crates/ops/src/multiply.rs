@@ -29,17 +29,11 @@ impl<'a> Right<'a> {
         let source = Source { values, stride, inner, count: columns, depth };
         let panel = source.blocks() * bf16::PAIRS * PANEL;
         let mut words = Words::new(source.words_right());
-        let pack = |(i, out): (usize, &mut [u32])| {
-            let first = i * PANEL;
-            let values = &values[first * stride..];
-            let part = Source { values, count: (columns - first).min(out.len() / panel * PANEL), ..source };
-            part.pack_right(out.as_chunks_mut().0);
-        };
-        if words.len() <= PIECE {
-            pack((0, &mut words));
-        } else {
-            words.par_chunks_exact_mut(panel).with_min_len(PIECE.div_ceil(panel)).enumerate().for_each(pack);
-        }
+        let panels = words.par_chunks_exact_mut(panel).with_min_len(PIECE.div_ceil(panel)).enumerate();
+        panels.for_each(|(i, out)| {
+            let (values, count) = (&values[i * PANEL * stride..], (columns - i * PANEL).min(PANEL));
+            Source { values, count, ..source }.pack_right(out.as_chunks_mut().0);
+        });
         Self::Packed(words)
     }
 }
