@@ -53,13 +53,6 @@ impl RenderOptions {
     }
 }
 
-impl Default for RenderOptions {
-    /// [`RenderOptions::inria`].
-    fn default() -> Self {
-        Self::inria()
-    }
-}
-
 /// Presets of [`RenderOptions`], as configs and command lines name them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

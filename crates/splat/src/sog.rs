@@ -186,12 +186,10 @@ impl Codebook {
         let mut values = columns.concat();
         values.iter_mut().for_each(|value| *value = value.clamp(-MOST, MOST));
         values.sort_unstable_by(f32::total_cmp);
-        let sums: Vec<f64> = std::iter::once(0.0)
-            .chain(values.iter().scan(0.0, |sum, value| {
-                *sum += f64::from(*value);
-                Some(*sum)
-            }))
-            .collect();
+        let mut sums = vec![0.0];
+        for value in &values {
+            sums.push(sums[sums.len() - 1] + f64::from(*value));
+        }
         let (low, high) = (values[0], values[values.len() - 1]);
         // Half of the codes are quantiles, half are even steps of the range, so that rare values have a code nearby.
         let mut codes: Vec<f32> = (0..CODES / 2)
