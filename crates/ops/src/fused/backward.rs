@@ -47,23 +47,9 @@ pub struct Backward<'a> {
     pub wanted: Needed,
 }
 
-/// Sums per channel over the gradient g of a source. The backward pass of its normalisation needs them.
-#[derive(Debug, Clone, Default)]
-pub struct GradientSums {
-    /// Σ g.
-    pub gradient: [f64; CHANNELS],
-    /// Σ g·(x − the plane's mean, in f32).
-    pub product: [f64; CHANNELS],
-}
-
-impl GradientSums {
-    fn add(&mut self, other: &Self) {
-        for c in 0..CHANNELS {
-            self.gradient[c] += other.gradient[c];
-            self.product[c] += other.product[c];
-        }
-    }
-}
+/// Sums per channel over the gradient g of a source: Σ g, and Σ g·(x − the plane's mean, in f32). The backward pass of
+/// its normalisation needs them.
+pub type GradientSums = [[f64; CHANNELS]; 2];
 
 /// Result of [`Backward::run`].
 #[derive(Debug, Clone, Default)]
@@ -79,7 +65,7 @@ pub struct Gradients {
 }
 
 impl Plane {
-    /// The mean that [`GradientSums::product`] subtracts: the exact mean, rounded to f32.
+    /// The mean that [`GradientSums`] subtract: the exact mean, rounded to f32.
     pub(super) fn centre(&self, channel: usize) -> f64 {
         f64::from(self.moments.mean[channel] as f32)
     }
@@ -107,7 +93,8 @@ impl Backward<'_> {
         for part in parts {
             all.weights.iter_mut().zip(&part.weights).for_each(|(a, b)| *a += b);
             all.bias.iter_mut().zip(&part.bias).for_each(|(a, b)| *a += b);
-            all.sums.iter_mut().zip(&part.sums).for_each(|(a, b)| a.add(b));
+            let sums = all.sums.as_flattened_mut().as_flattened_mut().iter_mut();
+            sums.zip(part.sums.as_flattened().as_flattened()).for_each(|(a, b)| *a += b);
         }
         Gradients { inputs, ..all }
     }
@@ -147,7 +134,7 @@ impl<'a> Band<'a> {
             doubled: chunk(),
             products: (vec![0.0; weights], 0),
             sums: Gradients {
-                sums: vec![GradientSums::default(); pass.sources.len()],
+                sums: vec![[[0.0; CHANNELS]; 2]; pass.sources.len()],
                 weights: vec![0.0; weights],
                 ..Gradients::default()
             },
@@ -267,11 +254,9 @@ impl<'a> Band<'a> {
         if affine.is_some() {
             let centre = std::array::from_fn(|c| plane.centre(c) as f32);
             let slopes = &self.slopes[..pixels * CHANNELS];
-            let [gradient, product] = arch.dispatch(Descend { input, centre, slopes, out });
-            for c in 0..CHANNELS {
-                self.sums.sums[source].gradient[c] += f64::from(gradient[c]);
-                self.sums.sums[source].product[c] += f64::from(product[c]);
-            }
+            let sums = arch.dispatch(Descend { input, centre, slopes, out });
+            let all = self.sums.sums[source].as_flattened_mut().iter_mut();
+            all.zip(sums.as_flattened()).for_each(|(all, sum)| *all += f64::from(*sum));
         }
     }
 }

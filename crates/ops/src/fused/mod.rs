@@ -18,7 +18,7 @@ use crate::buffers::Floats;
 pub use backward::{Backward, GradientSums, Gradients, Needed};
 pub use forward::{Conv, Shortcut};
 pub use merge::{Branch, Merge, add};
-pub use norm::{GROUPS, GroupNorm, GroupStatistics, Linear, NormGradients};
+pub use norm::{GROUPS, GroupNorm, GroupStatistics, Linear};
 pub use rows::Upstream;
 pub use weights::{arrange, rearrange, transpose};
 

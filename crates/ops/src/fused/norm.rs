@@ -23,17 +23,6 @@ pub struct GroupNorm<'a> {
     pub beta: &'a [f32],
 }
 
-/// Result of a normalisation's backward pass.
-#[derive(Debug, Clone)]
-pub struct NormGradients {
-    /// Gradient of the factors.
-    pub gamma: Vec<f64>,
-    /// Gradient of the summands.
-    pub beta: Vec<f64>,
-    /// Per plane, the map from the gradient of the result to the gradient of the plane.
-    pub maps: Vec<Linear>,
-}
-
 impl GroupNorm<'_> {
     fn per_group(&self) -> usize {
         self.gamma.len() / GROUPS
@@ -71,23 +60,24 @@ impl GroupNorm<'_> {
         (0..self.gamma.len() / CHANNELS).map(affine).collect()
     }
 
-    /// The backward pass from the sums over each plane's gradient. Statistics depend on the planes and add to the
-    /// planes' gradient.
+    /// The backward pass from the sums over each plane's gradient: the gradients of factors and summands, and per plane
+    /// the map from the gradient of the result to the plane's gradient, to which the statistics add.
     pub fn backward(
         &self,
         [mean, rstd]: &GroupStatistics,
         planes: &[&Plane],
         sums: &[GradientSums],
-    ) -> NormGradients {
+    ) -> ([Vec<f64>; 2], Vec<Linear>) {
         let per_group = self.per_group();
         let channels = self.gamma.len();
-        let beta: Vec<f64> = (0..channels).map(|i| sums[i / CHANNELS].gradient[i % CHANNELS]).collect();
+        let beta: Vec<f64> = (0..channels).map(|i| sums[i / CHANNELS][0][i % CHANNELS]).collect();
         // Σ g·x̂. The sums are about the plane's own mean, which can differ from the group's mean.
         let gamma: Vec<f64> = (0..channels)
             .map(|i| {
                 let (plane, c, g) = (i / CHANNELS, i % CHANNELS, i / per_group);
                 let distance = planes[plane].centre(c) - f64::from(mean[g]);
-                f64::from(rstd[g]) * (sums[plane].product[c] + distance * sums[plane].gradient[c])
+                let [gradient, product] = &sums[plane];
+                f64::from(rstd[g]) * (product[c] + distance * gradient[c])
             })
             .collect();
         let members = planes[0].moments.count * per_group as f64;
@@ -109,7 +99,6 @@ impl GroupNorm<'_> {
             });
             std::array::from_fn(|part| coefficients.map(|channel| channel[part]))
         };
-        let maps = (0..planes.len()).map(map).collect();
-        NormGradients { gamma, beta, maps }
+        ([gamma, beta], (0..planes.len()).map(map).collect())
     }
 }

@@ -210,13 +210,13 @@ impl Pass<'_> {
     /// Adds a normalisation's gradients to the sums. Returns the maps to the planes' gradients.
     fn norm(&mut self, norm: &Norm, planes: &[&Plane], sums: &[GradientSums]) -> Vec<Linear> {
         let group_norm = self.network.norm(norm, self.parameters);
-        let gradients = group_norm.backward(&self.sample.layers[norm.index], planes, sums);
+        let ([gamma, beta], maps) = group_norm.backward(&self.sample.layers[norm.index], planes, sums);
         if self.wanted.parameters {
             let add = |(sum, g): (&mut f64, &f64)| *sum += g;
-            self.sums[norm.gamma.clone()].iter_mut().zip(&gradients.gamma).for_each(add);
-            self.sums[norm.beta.clone()].iter_mut().zip(&gradients.beta).for_each(add);
+            self.sums[norm.gamma.clone()].iter_mut().zip(&gamma).for_each(add);
+            self.sums[norm.beta.clone()].iter_mut().zip(&beta).for_each(add);
         }
-        gradients.maps
+        maps
     }
 
     /// Adds a convolution's gradients, which are in the kernels' order, to the sums.
