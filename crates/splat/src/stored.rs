@@ -125,16 +125,11 @@ impl Stored {
     /// Makes drawable what other programs' files have: logits of the opacities 0 and 1 and logarithms of the scale 0
     /// become those that [`Self::of`] stores, and quaternions that a render takes for damage get the length 1.
     pub(crate) fn limit(&mut self) {
-        for (column, value) in self.columns[7..11].iter_mut().enumerate() {
-            let is_opacity = column == 3;
-            for value in value.iter_mut().filter(|value| value.is_infinite()) {
-                match (is_opacity, *value > 0.0) {
-                    (true, is_solid) => *value = logit(f32::from(u8::from(is_solid))),
-                    (false, false) => *value = MIN_SCALE.ln(),
-                    // An infinite size.
-                    (false, true) => {}
-                }
-            }
+        // Infinite sizes stay.
+        let scales = self.columns[7..10].iter_mut().flatten().filter(|log| **log == f32::NEG_INFINITY);
+        scales.for_each(|log| *log = MIN_SCALE.ln());
+        for value in self.columns[10].iter_mut().filter(|value| value.is_infinite()) {
+            *value = logit(if *value > 0.0 { 1.0 } else { 0.0 });
         }
         for i in 0..self.len() {
             let q = [3, 4, 5, 6].map(|column| self.columns[column][i]);

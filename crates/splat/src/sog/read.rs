@@ -18,9 +18,6 @@ const ENTRIES: u32 = 64;
 const LARGEST_PALETTE: u64 = 15 << 16;
 /// Bytes of a Gaussian in memory: its columns, and its pixels of five pictures.
 const BYTES: u64 = 14 * 4 + 5 * 4;
-/// For each SH basis function, whether a turn by 180° about z negates it.
-const REVERSED: [bool; 16] =
-    [false, true, false, true, false, true, false, true, false, true, false, true, false, true, false, true];
 
 /// Reads a SOG, a ZIP archive of `length` bytes.
 pub(crate) fn read(mut input: impl Read, length: u64) -> Result<Stored, Problem> {
@@ -90,8 +87,9 @@ pub(crate) fn read(mut input: impl Read, length: u64) -> Result<Stored, Problem>
         let labels = of_each("shN", 1)?;
         let centroids = picture("shN", 0)?;
         for channel in 0..3 {
-            for (band, is_reversed) in REVERSED.iter().enumerate().take(coefficients).skip(1) {
-                let sign = if *is_reversed { -1.0 } else { 1.0 };
+            for band in 1..coefficients {
+                // A turn by 180° about z negates every second basis function.
+                let sign = if band % 2 == 1 { -1.0 } else { 1.0 };
                 let value = |pixel: &image::Rgba<u8>| {
                     let label = u32::from(u16::from_le_bytes([pixel[0], pixel[1]]));
                     let column = label % ENTRIES * (coefficients as u32 - 1) + band as u32 - 1;
