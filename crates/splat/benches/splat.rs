@@ -114,15 +114,14 @@ fn run(case: &Case, tracked: Tracked, device: &Device, on_host: bool) {
     });
     let ms = |figure: Figure| format!("{:.1}", figure.time.as_secs_f64() * 1e3);
     let pixels = case.views * case.size as usize * case.size as usize;
-    let mb =
-        |figure: Figure| if on_host { format!("{:.1}", figure.bytes as f64 / 1e6) } else { "–".into() };
+    let of_host = |text: String| if on_host { text } else { "–".into() };
+    let mb = |figure: Figure| of_host(format!("{:.1}", figure.bytes as f64 / 1e6));
     // The image comes out, its gradient comes in, the inputs' gradients come out: they are not scratch memory.
     let (image, upstream) = (16 * pixels, 12 * pixels);
     let gradients = case.n * if tracked == Tracked::Everything { 56 } else { 12 };
     let budget = (400 * case.n + 40 * pixels) as f64;
-    let share = |figure: Figure, outputs: usize| match on_host {
-        true => format!("{:.0} %", 100.0 * figure.bytes.saturating_sub(outputs) as f64 / budget),
-        false => "–".into(),
+    let share = |figure: Figure, outputs: usize| {
+        of_host(format!("{:.0} %", 100.0 * figure.bytes.saturating_sub(outputs) as f64 / budget))
     };
     let tracked = match tracked {
         Tracked::Nothing => "nothing",

@@ -100,8 +100,7 @@ mod tests {
             "position": eye.to_array(), "rotation": rows, "fx": focal, "fy": focal }]);
         let field = serde_json::json!({ "w": 640.0, "h": 640, "fl_x": focal, "cx": cx, "cy": cy, "k1": 0.0,
             "frames": [{ "transform_matrix": [turned[0], turned[1], turned[2], [0.0, 0.0, 0.0, 1.0]] }] });
-        let bare = serde_json::json!({ "camera_angle_x": angle,
-            "frames": [{ "transform_matrix": [turned[0], turned[1], turned[2], [0.0, 0.0, 0.0, 1.0]] }] });
+        let bare = serde_json::json!({ "camera_angle_x": angle, "frames": field["frames"] });
         let point = DVec3::new(0.3, 1.1, -0.2);
         let (seen, depth) = camera.project(point).expect("in front");
         for (value, has_middle) in [(&splatting, false), (&field, true), (&bare, false)] {
