@@ -5,6 +5,8 @@ use std::sync::{Arc, Mutex, TryLockError};
 use burn::tensor::Device;
 use snapsnap_mesh::export::{self, Kind as MeshKind};
 use snapsnap_mesh::fuse::fuse;
+use snapsnap_people::poses::{MOTIONS, Motion};
+use snapsnap_rig::{Rig, RigError};
 use snapsnap_splat::scene::{Kind, Stored};
 
 use crate::commands::mesh;
@@ -19,17 +21,20 @@ use crate::turntable;
 pub enum Download {
     Gaussians(Kind),
     Mesh,
+    /// A mesh with skeleton and motions.
+    Rigged,
     Turntable,
 }
 
 /// Paths of the files behind `scene.`, which are also their extensions.
-const FILES: [(&str, Download); 7] = [
+const FILES: [(&str, Download); 8] = [
     ("ply", Download::Gaussians(Kind::Ply)),
     ("y-down.ply", Download::Gaussians(Kind::YDown)),
     ("spz", Download::Gaussians(Kind::Spz)),
     ("sog", Download::Gaussians(Kind::Sog)),
     ("gaussians.glb", Download::Gaussians(Kind::Glb)),
     ("glb", Download::Mesh),
+    ("rigged.glb", Download::Rigged),
     ("gif", Download::Turntable),
 ];
 
@@ -42,16 +47,28 @@ impl Download {
 
     /// Whether it takes all cores for many seconds.
     pub fn is_long(self) -> bool {
-        matches!(self, Self::Mesh | Self::Turntable)
+        matches!(self, Self::Mesh | Self::Rigged | Self::Turntable)
     }
 
     /// The file's bytes. `step` is called with the name of each step of a long one.
     pub fn make(self, stored: &Stored, step: &dyn Fn(&str)) -> Result<Vec<u8>, Failure> {
         match self {
             Self::Gaussians(kind) => Ok(stored.to_bytes(kind)?),
-            Self::Mesh => {
-                let fused = fuse(&stored.load(&Device::flex()), mesh::options(MeshKind::Glb), step)?;
-                export::glb_bytes(&fused.mesh, None).map_err(|e| Failure::Internal(e.to_string()))
+            Self::Mesh | Self::Rigged => {
+                let scene = stored.load(&Device::flex());
+                let mesh = fuse(&scene, mesh::options(MeshKind::Glb), step)?.mesh;
+                let skin = (self == Self::Rigged).then(|| {
+                    step("skeleton");
+                    let rig = Rig::new(&scene, &mesh)?;
+                    let mut skin = rig.skin(&mesh);
+                    for name in MOTIONS {
+                        skin.clips
+                            .extend(Motion::named(name).map(|motion| rig.clip(name, &motion)).transpose()?);
+                    }
+                    Ok::<_, RigError>(skin)
+                });
+                let skin = skin.transpose()?;
+                export::glb_bytes(&mesh, skin.as_ref()).map_err(|e| Failure::Internal(e.to_string()))
             }
             Self::Turntable => {
                 let counted = |done, all| step(&format!("{done} of {all} pictures"));

@@ -118,7 +118,7 @@ enum Command {
     #[command(after_help = "Example: snapsnap mesh human.ply -o human.glb")]
     Mesh(commands::mesh::Arguments),
     /// Give a person a skeleton: a mesh that moves, or the person in another pose.
-    #[command(after_help = "Example: snapsnap rig human.ply -o human.glb --motion walk.bvh")]
+    #[command(after_help = "Example: snapsnap rig human.ply -o human.glb --motion walk")]
     Rig(commands::rig::Arguments),
     /// Turn a file of Gaussians into another kind: PLY, SPZ, which is an eighth as large, GLB or SOG.
     #[command(after_help = "Example: snapsnap convert human.ply human.spz")]

@@ -1,5 +1,6 @@
 //! Poses from motion files (BVH): the positions of the joints become the angles of a pose, for any body.
 
+use std::f32::consts::{PI, TAU};
 use std::path::Path;
 
 use glam::{Mat3, Vec3};
@@ -74,6 +75,64 @@ pub struct Motion {
     pub poses: Vec<Pose>,
     /// Time between two frames, seconds.
     pub step: f32,
+}
+
+/// Names of [`Motion::named`].
+pub const MOTIONS: [&str; 3] = ["idle", "walk", "wave"];
+
+impl Motion {
+    /// A motion of this program, which ends as it begins: to stand at ease, to walk on the spot, or to wave.
+    pub fn named(name: &str) -> Option<Self> {
+        const RATE: f32 = 30.0;
+        let (seconds, pose): (f32, fn(f32) -> Pose) = match name {
+            "idle" => (4.0, idle),
+            "walk" => (1.1, walk),
+            "wave" => (2.4, wave),
+            _ => return None,
+        };
+        let last = (seconds * RATE).round();
+        let poses = (0..=last as usize).map(|frame| pose(TAU * frame as f32 / last)).collect();
+        Some(Self { poses, step: 1.0 / RATE })
+    }
+}
+
+/// To breathe and sway. Motions have a phase from 0 to 2π.
+fn idle(phase: f32) -> Pose {
+    let (breath, sway) = (libm::sinf(2.0 * phase), libm::sinf(phase));
+    Pose {
+        trunk: [1.0 + 0.6 * breath, 1.5 * sway, 0.8 * sway],
+        head: [1.0 - 0.5 * breath, 5.0 * libm::sinf(phase + 0.6), 0.0],
+        arms: [[9.0 + 0.8 * breath, 1.0, 8.0, 10.0 + breath], [9.0 + 0.8 * breath, 1.0, 8.0, 10.0 - breath]],
+        legs: [[0.0, 3.0, 1.0]; 2],
+        ..Pose::default()
+    }
+}
+
+fn walk(phase: f32) -> Pose {
+    let step = libm::sinf(phase);
+    let leg = |phase: f32| {
+        // The knee bends while the leg swings forwards.
+        let swing = libm::cosf(phase + 0.3).max(0.0);
+        [24.0 * libm::sinf(phase) + 8.0 * swing, 1.0, 6.0 + 52.0 * swing * swing]
+    };
+    let arm = |step: f32| [9.0, -22.0 * step, 6.0, 22.0 - 10.0 * step];
+    Pose {
+        trunk: [3.0, -6.0 * step, 1.5 * libm::cosf(phase)],
+        head: [0.0, 4.0 * step, 0.0],
+        arms: [arm(step), arm(-step)],
+        legs: [leg(phase), leg(phase + PI)],
+        ..Pose::default()
+    }
+}
+
+/// The right arm rises, waves twice and sinks.
+fn wave(phase: f32) -> Pose {
+    let up = (1.6 * libm::sinf(0.5 * phase)).min(1.0);
+    let up = up * up * (3.0 - 2.0 * up);
+    let idle = idle(phase);
+    let waving = [78.0, 0.0, -85.0, 92.0 + 24.0 * libm::sinf(3.0 * phase)];
+    let right = [0, 1, 2, 3].map(|i| idle.arms[1][i] + up * (waving[i] - idle.arms[1][i]));
+    Pose { arms: [idle.arms[0], right], ..idle }
 }
 
 /// A joint: its parent's index, its offset from the parent, and its channels.

@@ -84,14 +84,14 @@ impl Rig {
     ///
     /// # Errors
     /// [`RigError::Impossible`].
-    pub fn clip(&self, name: String, motion: &Motion) -> Result<Clip, RigError> {
+    pub fn clip(&self, name: &str, motion: &Motion) -> Result<Clip, RigError> {
         let joints = bones::joints(&self.bones);
         let frame = |pose: &Pose| {
             let moved = self.transforms(pose)?.into_iter().zip(&joints);
             Ok(moved.map(|(transform, joint)| transform * joint.rest).collect())
         };
         let frames = motion.poses.iter().map(frame).collect::<Result<_, RigError>>()?;
-        Ok(Clip { name, step: motion.step, frames })
+        Ok(Clip { name: name.to_owned(), step: motion.step, frames })
     }
 
     /// Moves Gaussians and turns them with their bones. Their sizes stay.

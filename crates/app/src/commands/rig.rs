@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use snapsnap_mesh::export::{Skin, glb_bytes};
+use snapsnap_mesh::export::glb_bytes;
 use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::Mesh;
-use snapsnap_people::{Pose, poses};
+use snapsnap_people::Pose;
+use snapsnap_people::poses::{self, Motion};
 use snapsnap_rig::{Rig, pose_mesh};
 use snapsnap_splat::scene::{Kind, Loaded, Stored};
 
@@ -34,8 +35,8 @@ pub struct Arguments {
     /// Frame of the motion file of --pose.
     #[arg(long, value_name = "N", default_value_t = 0)]
     frame: usize,
-    /// Motion file that goes into the GLB as an animation. May be repeated.
-    #[arg(long, value_name = "FILE.bvh")]
+    /// Motion that goes into the GLB as an animation: idle, walk, wave or a file. May be repeated.
+    #[arg(long, value_name = "NAME|FILE.bvh")]
     motion: Vec<PathBuf>,
     #[command(flatten)]
     surface: SurfaceArguments,
@@ -64,7 +65,11 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let inputs: Vec<&Path> = [input].into_iter().chain(pose).chain(motion).map(PathBuf::as_path).collect();
     check_outputs(&[output], &inputs)?;
     let pose = pose.as_deref().map(|pose| read_pose(pose, arguments.frame)).transpose()?;
-    let motions: Result<Vec<_>, Failure> = motion.iter().map(|path| Ok((path, poses::read(path)?))).collect();
+    let motions = motion.iter().map(|path| {
+        let own = path.to_str().and_then(Motion::named);
+        Ok((path, own.map_or_else(|| poses::read(path), Ok)?))
+    });
+    let motions: Result<Vec<_>, Failure> = motions.collect();
     let motions = motions?;
 
     let scene = read(input)?.load(&device::choose(&arguments.device)?);
@@ -76,15 +81,15 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     progress.stage("writing");
     if let (false, Some(transforms)) = (is_mesh, &transforms) {
         let posed = rig.pose_gaussians(&scene.gaussians, transforms);
-        Stored::of(&posed)?.write(output)?;
+        Stored::of(&posed)?.write(Kind::of(output), output)?;
         drop(progress);
         say::info(&format!("{}: {} Gaussians", output.display(), posed.len()));
         return Ok(());
     }
-    let mut skin: Skin = rig.skin(&mesh);
+    let mut skin = rig.skin(&mesh);
     for (path, motion) in &motions {
-        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        skin.clips.push(rig.clip(name, motion)?);
+        let name = path.file_stem().unwrap_or_default().to_string_lossy();
+        skin.clips.push(rig.clip(&name, motion)?);
     }
     if let Some(transforms) = &transforms {
         pose_mesh(&mut mesh, &skin.weights, transforms);

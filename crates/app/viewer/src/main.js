@@ -8,6 +8,7 @@ import { inBatches } from "./batches.js";
 import { bounds, hasYDown, nearestTo } from "./gaussians.js";
 import { listen } from "./keys.js";
 import { openLan } from "./lan.js";
+import { loadSkeleton } from "./moving.js";
 import { save, saveLong } from "./saving.js";
 import { openStudio } from "./studio.js";
 import "./style.css";
@@ -202,6 +203,8 @@ async function show(what, read) {
   document.title = `${name} – snapsnap`;
   // The downloads contain the served file only.
   element("downloads").classList.toggle("hidden", !served);
+  element("moving").classList.toggle("hidden", !served);
+  [skeleton, moves, element("motion").value] = [null, false, ""];
   say("");
 }
 
@@ -291,10 +294,12 @@ function saveCamera() {
 }
 element("camera").addEventListener("click", saveCamera);
 
+/** Extensions of the files that take long. */
+const LONG = { mesh: "glb", skeleton: "rigged.glb", turntable: "gif" };
 for (const link of document.querySelectorAll("#downloads .long")) {
   link.addEventListener("click", (event) => {
     event.preventDefault();
-    saveLong(link, `${stem()}.${link.id === "mesh" ? "glb" : "gif"}`, say);
+    saveLong(link, `${stem()}.${LONG[link.id]}`, say);
   });
 }
 
@@ -363,6 +368,34 @@ const saveScreenshot = async () => save(await screenshot(), `${stem()}.png`);
 element("screenshot").addEventListener("click", saveScreenshot);
 listen({ turn, shift, zoom, lookFrom, rotate, turnOver, saveScreenshot, saveCamera, help });
 
+/** The shown person's skeleton once it is loaded, and whether it moves. */
+let skeleton = null;
+let moves = false;
+
+element("motion").addEventListener("input", async () => {
+  const [mesh, name] = [shown, element("motion").value];
+  moves = false;
+  element("motion").disabled = true;
+  try {
+    if (name && !skeleton) {
+      say("Making the skeleton …");
+      const loaded = await loadSkeleton(mesh, `${address}scene.rigged.glb`, (step) => say(`Making the skeleton: ${step} …`));
+      if (mesh !== shown) {
+        return;
+      }
+      skeleton = loaded;
+      say("");
+    }
+    skeleton?.play(element("motion").value);
+    moves = Boolean(skeleton && element("motion").value);
+  } catch (error) {
+    say(`No skeleton: ${error.message ?? error}`);
+    element("motion").value = "";
+  }
+  element("motion").disabled = false;
+  redraw();
+});
+
 // Number of consecutive frames, and their time in milliseconds.
 let drawn = 0;
 let busy = 0;
@@ -373,6 +406,10 @@ renderer.setAnimationLoop((now) => {
   if (still === REST) {
     hold();
     redraw();
+  }
+  if (moves) {
+    skeleton.move(last === null ? 0 : (now - last) / 1000);
+    changed = true;
   }
   if (!changed) {
     last = null;
