@@ -121,8 +121,7 @@ pub fn all() -> Vec<Format> {
         // The first character is for test.
         prepare("avatars", "b_suit.glb", "avatars in/avatars --subjects 1"),
         // The people whose files are sound are made.
-        Format { kept: &["out"], ..prepare("smplx", ".pkl .json", "scan in/scans --smplx in/scans") }
-            .cases(40),
+        Format { kept: &["out"], ..prepare("smplx", ".pkl", "scan in/scans --smplx in/scans") }.cases(40),
         prepare("config-data", "training.toml", "scan in/a.obj --config in/training.toml"),
         // The person of seed 2 wears a suit, shoes and hair.
         prepare("makehuman", body, "makehuman in/makehuman --subjects 1 --seed 2"),

@@ -148,10 +148,7 @@ pub fn make(folder: &Path, name: &str) {
         "mesh_ascii.ply" => put(&path, mesh_ply(&pyramid(folder), Format::Ascii)),
         // Scans with the parameters of their bodies.
         "scans" => {
-            make(&path, "a.obj");
-            let a = r#"{"betas": [[0.1, 0.2]], "global_orient": [[0.1, 1.5708, 0]], "scale": 1.0}"#;
-            put(&path.join("a.json"), a);
-            for subject in ["protocol2", "protocol4", "big_endian"] {
+            for subject in ["protocol2", "protocol4", "big_endian", "numpy2"] {
                 let parameters = format!("{subject}.pkl");
                 copy(&format!("crates/data/tests/smplx/{parameters}"), &path.join(parameters));
                 put(&path.join(format!("{subject}.obj")), PYRAMID);

@@ -36,8 +36,8 @@ pub struct Arguments {
     /// Collection of the scans. It decides axes, positions and splits.
     #[arg(long, value_parser = one_of(COLLECTIONS), default_value = "other")]
     collection: Collection,
-    /// Folder of SMPL-X parameters (ID/smplx_param.pkl, ID.pkl or .json), which contain the direction that a subject
-    /// faces [default: the scan's folder].
+    /// Folder of SMPL-X parameters (ID/smplx_param.pkl or ID.pkl), which contain the direction that a subject faces
+    /// [default: the scan's folder].
     #[arg(long, value_name = "DIR")]
     smplx: Option<PathBuf>,
     /// Split of all subjects [default: the published lists; the first 100 of 2K2K and all of 4D-Dress test, others
@@ -115,18 +115,13 @@ fn describe(arguments: &Arguments) -> String {
 
 /// Path of the subject's SMPL-X parameters. It is an error if `folder` is given and has none.
 fn parameters(scan: &Path, subject: &str, folder: Option<&Path>) -> Result<Option<PathBuf>, FileError> {
-    let stem = scan.file_stem().unwrap_or_default();
-    let names = [stem.to_string_lossy().into_owned(), subject.to_owned()];
-    let beside = scan.parent().unwrap_or(Path::new("."));
-    let within = |folder: &Path| ["pkl", "json"].map(|kind| folder.join(format!("smplx_param.{kind}")));
+    const NAME: &str = "smplx_param.pkl";
     let Some(folder) = folder else {
-        return Ok(within(beside).into_iter().find(|path| path.is_file()));
+        return Ok(Some(scan.with_file_name(NAME)).filter(|path| path.is_file()));
     };
-    let candidates = names.iter().flat_map(|name| {
-        let named = ["pkl", "json"].map(|kind| folder.join(format!("{name}.{kind}")));
-        within(&folder.join(name)).into_iter().chain(named)
-    });
-    match candidates.into_iter().find(|path| path.is_file()) {
+    let stem = scan.file_stem().unwrap_or_default().to_string_lossy();
+    let within = |name: &str| [folder.join(name).join(NAME), folder.join(format!("{name}.pkl"))];
+    match [&*stem, subject].into_iter().flat_map(within).find(|path| path.is_file()) {
         Some(found) => Ok(Some(found)),
         None => Err(FileError::unsuitable(folder, format!("has no SMPL-X parameters of subject {subject}"))),
     }
