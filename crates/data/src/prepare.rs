@@ -265,21 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn pitch_and_distance_move_the_cameras() {
-        let mut config = DataConfig::default();
-        (config.views.pitch, config.views.distance) = (10.0, 1.2);
-        assert_eq!(config.refusal(), None);
-        let (published, far) = (Orbit::default(), config.cameras(0.0, "a")[0]);
-        let [from, to] =
-            [Camera::orbit_at_yaw_degrees(0.0, 1024), far].map(|c| c.centre() - published.centre);
-        assert!((to.length() / from.length() - 1.2).abs() < 1e-9);
-        assert!((to.angle_between(from).to_degrees() - 10.0).abs() < 1e-9 && to.y > from.y);
-        config.views.distance = 0.4;
-        assert_eq!(config.refusal().expect("a problem").0, "views.distance");
-    }
-
-    #[test]
-    fn side_cameras_of_a_group_are_quarter_turns_of_its_front_camera() {
+    fn fronts_of_groups_are_near_the_subjects_own_and_backs_deviate() {
         let mut config = DataConfig::default();
         (config.views.arrangement, config.views.count) = (Arrangement::Groups, 12);
         config.jitter.rig = Jitter { pitch: 6.0, distance: 0.1, roll: 2.0, ..Jitter::default() };
@@ -293,42 +279,12 @@ mod tests {
             let front = yaw(&group[0]);
             assert!(apart(front, 40.0).abs() < 30.1, "{front}");
             assert!(apart(yaw(&group[1]), front + 180.0).abs() < 8.0 && yaw(&group[1]) != front + 180.0);
-            for (side, degrees) in [(&group[2], 90.0), (&group[3], 270.0)] {
-                assert!(apart(yaw(side), front + degrees).abs() < 1e-9);
-                assert!((side.centre().y - group[0].centre().y).abs() < 1e-12);
-            }
         }
         assert!(cameras[0] != cameras[4] && cameras[4] != cameras[8]);
         config.views.count = 6;
         assert_eq!(config.refusal().expect("a problem").0, "views.count");
         (config.views.count, config.views.layout) = (8, Layout::Authors);
         assert_eq!(config.refusal().expect("a problem").0, "views.arrangement");
-    }
-
-    #[test]
-    fn jitter_stays_in_its_ranges_and_follows_the_name() {
-        let mut config = DataConfig::default();
-        config.jitter.view = Jitter {
-            yaw: 5.0,
-            pitch: 4.0,
-            roll: 3.0,
-            distance: 0.2,
-            focal: 0.1,
-            look_at: 0.05,
-            ..Jitter::default()
-        };
-        let cameras = |name: &str| config.cameras(0.0, name);
-        assert_eq!(cameras("a"), cameras("a"));
-        assert_ne!(cameras("a"), cameras("b"));
-        let all: Vec<Camera> = (0..40).flat_map(|i| cameras(&i.to_string())).collect();
-        let distance = |camera: &Camera| (camera.centre() - Orbit::default().centre).length();
-        let (nearest, furthest) = range(all.iter().map(distance));
-        let (shortest, longest) = range(all.iter().map(|camera| camera.focal.x / 1024.0));
-        assert!(nearest > 1.7 && furthest < 2.3 && furthest - nearest > 0.4, "{nearest} {furthest}");
-        assert!(shortest >= 0.72 && longest <= 0.88 && longest - shortest > 0.15, "{shortest} {longest}");
-        assert_eq!(config.refusal(), None);
-        config.jitter.rig.focal = 0.6;
-        assert_eq!(config.refusal(), Some(("jitter.rig.focal".into(), "is 0.6, must be 0 to 0.5".into())));
     }
 
     /// From 1.6 to 4 metres, a person has about the same size in all pictures, and is near the middle.

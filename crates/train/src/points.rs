@@ -79,39 +79,3 @@ pub(crate) fn offsets(h: usize, w: usize) -> Vec<[usize; 2]> {
     let apart = SPACINGS.into_iter().flat_map(|spacing| [[spacing, 0], [0, spacing]]);
     [[0, 0]].into_iter().chain(apart.filter(|[down, across]| *down < h && *across < w)).collect()
 }
-
-#[cfg(test)]
-mod tests {
-    use burn::tensor::{Device, TensorData};
-
-    use super::*;
-
-    #[test]
-    fn relief_is_free_of_the_place_and_measures_slopes() {
-        let (h, w) = (9, 12);
-        let error = |of: &dyn Fn(usize, usize) -> [f32; 3], is_inside: &dyn Fn(usize, usize) -> bool| {
-            let places = || (0..h).flat_map(|row| (0..w).map(move |column| (row, column)));
-            let off: Vec<f32> = places().flat_map(|(row, column)| of(row, column)).collect();
-            let inside: Vec<f32> =
-                places().map(|(row, column)| f32::from(u8::from(is_inside(row, column)))).collect();
-            let off = Tensor::<4>::from_data(TensorData::new(off, [1, h, w, 3]), &Device::flex());
-            let inside = Tensor::<3>::from_data(TensorData::new(inside, [1, h, w]), &Device::flex());
-            let offsets = offsets(h, w);
-            assert_eq!(offsets.len(), 9);
-            let lengths = mean_lengths(off, inside, &offsets);
-            f64::from(lengths.narrow(1, 1, 8).mean().into_scalar::<f32>())
-        };
-        // The least length of a difference is 1e-12.
-        assert!(error(&|_, _| [0.3, -0.2, 0.7], &|_, _| true) < 1e-11);
-        // 5 mm a column: the mean of 1, 2, 4 and 8 columns, and nothing along the columns.
-        let slope = |_: usize, column: usize| [0.003 * column as f32, 0.0, 0.004 * column as f32];
-        let expected = 0.005 * (1.0 + 2.0 + 4.0 + 8.0) / 8.0;
-        assert!((error(&slope, &|_, _| true) - expected).abs() < 1e-8);
-        // Pairs with a pixel outside do not count.
-        let spike =
-            |row: usize, column: usize| if (row, column) == (4, 5) { [9.0; 3] } else { slope(row, column) };
-        assert!((error(&spike, &|row, column| (row, column) != (4, 5)) - expected).abs() < 1e-8);
-        assert!(error(&spike, &|_, _| true) > 2.0 * expected);
-        assert_eq!(error(&slope, &|_, _| false), 0.0);
-    }
-}

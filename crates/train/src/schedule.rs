@@ -105,15 +105,6 @@ mod tests {
     }
 
     #[test]
-    fn cosine_has_its_first_highest_and_last_rate() {
-        let share = |step| Schedule::Cosine { warm_up: 99 }.share(step, 1000);
-        assert!((share(0) - 0.01).abs() < 1e-12 && (share(98) - 0.99).abs() < 1e-12);
-        assert!((share(99) - 1.0).abs() < 1e-12 && (share(999) - 0.01).abs() < 1e-12);
-        let short = |step| Schedule::Cosine { warm_up: 0 }.share(step, 1);
-        assert!(short(0).is_finite() && short(7).is_finite());
-    }
-
-    #[test]
     fn trapezoid_is_constant_until_it_falls() {
         let schedule = Schedule::Trapezoid { warm_up: 9, fall: 100 };
         let share = |step| schedule.share(step, 1000);

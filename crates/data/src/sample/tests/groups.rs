@@ -277,25 +277,3 @@ fn samples_without_sides_are_those_with_sides_without_them() {
         }
     }
 }
-
-/// Second surfaces follow the four views in batches, sample by sample.
-#[test]
-fn batches_have_second_surfaces_after_the_views() {
-    let (_temporary, folder) = data_of_armed(64);
-    let samples = SampleConfig { second_depth: true, ..SampleConfig::default() };
-    let mut items: Vec<_> =
-        (0..8).map(|i| stage1(&folder, samples.clone()).sample(i).expect("reads")).collect();
-    items.dedup_by(|a, b| a.points == b.points);
-    items.truncate(2);
-    let batch = Stage1Batch::new(items.clone(), &Device::flex());
-    assert_eq!((batch.points.dims(), batch.valid.dims()), ([2, 6, 64, 64, 3], [2, 6, 64, 64]));
-    let values = |data: TensorData| data.try_into_vec::<f32>().expect("f32");
-    for (sample, item) in items.iter().enumerate() {
-        for view in 0..6 {
-            let at = [sample..sample + 1, view..view + 1];
-            let points = values(batch.points.clone().slice(at.clone()).into_data());
-            let valid = values(batch.valid.clone().slice(at).into_data());
-            assert!(item.truth(view) == Some((&points, &valid)), "sample {sample}, view {view}");
-        }
-    }
-}
