@@ -1,6 +1,7 @@
 //! Steps of a training: samples → loss → gradients → weights. This module writes no files.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Instant;
 
 use burn::data::dataset::Dataset;
@@ -157,7 +158,7 @@ impl<'a, T: Task> Learner<'a, T> {
     }
 
     fn update(&mut self, step: u64) -> Result<Result<BTreeMap<String, f64>, Skipped>> {
-        let Loaded { items, first, count } = match self.load(step) {
+        let (items, first, count) = match self.load(step) {
             Ok(loaded) => loaded,
             // The reason names the damaged file.
             Err(why) => return Ok(Err(why)),
@@ -242,18 +243,24 @@ impl<'a, T: Task> Learner<'a, T> {
         Ok(Ok((values, gradients::collect(&self.networks, &mut tracked))))
     }
 
-    /// This rank's part of a batch by its number since the beginning of the run, or the reason why any rank cannot load
-    /// its part. The content of a batch follows from its number alone.
-    fn load(&mut self, number: u64) -> Result<Loaded<T::Item>, Skipped> {
+    /// Samples of this rank's part of a batch by its number since the beginning of the run, the number of the batch's
+    /// samples that lower ranks have, and of all its samples; or the reason why any rank cannot load its part. The
+    /// content of a batch follows from its number alone.
+    fn load(&mut self, number: u64) -> Result<(Vec<T::Item>, usize, usize), Skipped> {
         let (t, ranks) = (&self.config.training, self.ranks);
         let per_pass = self.in_pass.div_ceil(t.batch).max(1) as u64;
         let (pass, place) = (number / per_pass, (number % per_pass) as usize);
         let mut open = self.open.take().filter(|(_, next)| *next == number && place > 0);
         let (batches, next) = open.get_or_insert_with(|| {
-            let loader = Loader::new(self.task.data().pass(pass), t.batch, t.workers, PREFETCH);
-            let loader = loader.part(ranks.rank, ranks.size);
-            // The published code takes people in order.
-            let loader = if self.config.mode.compat { loader } else { loader.shuffled(t.seed) };
+            let loader = Loader::<T::Item> {
+                dataset: Arc::new(self.task.data().pass(pass)),
+                batch: t.batch,
+                workers: t.workers,
+                prefetch: PREFETCH,
+                // The published code takes people in order.
+                shuffle: (!self.config.mode.compat).then_some(t.seed),
+                part: [ranks.rank, ranks.size],
+            };
             (loader.batches(pass, place), number)
         });
         *next += 1;
@@ -265,7 +272,7 @@ impl<'a, T: Task> Learner<'a, T> {
             return Err(why);
         }
         let count = t.batch.min(self.in_pass - place * t.batch);
-        Ok(Loaded { items: made?, first: ranks.share(count).start, count })
+        Ok((made?, ranks.share(count).start, count))
     }
 }
 
@@ -276,12 +283,3 @@ fn of_samples(why: &str, names: &[String]) -> Skipped {
 /// Result of a batch: the loss and its parts by name, none if no sample shows a person; and the gradients. Or the reason
 /// why the step is skipped, without its samples.
 type Made = Result<(BTreeMap<String, f64>, Rows), String>;
-
-/// Samples of this rank's part of a batch.
-struct Loaded<I> {
-    items: Vec<I>,
-    /// Number of samples of the batch that lower ranks have.
-    first: usize,
-    /// Number of samples of the whole batch.
-    count: usize,
-}

@@ -14,47 +14,23 @@ use snapsnap_base::random::stream;
 
 /// Loads batches of items of type `I`.
 pub struct Loader<I> {
-    dataset: Arc<dyn Dataset<I>>,
-    batch: usize,
-    workers: usize,
-    prefetch: usize,
+    /// The items.
+    pub dataset: Arc<dyn Dataset<I>>,
+    /// Items of a batch; the last one may be smaller.
+    pub batch: usize,
+    /// Threads.
+    pub workers: usize,
+    /// At most `workers + prefetch` batches are loaded before they are taken.
+    pub prefetch: usize,
     /// Seed of the order, if it is random. Every pass has its own order.
-    shuffle: Option<u64>,
+    pub shuffle: Option<u64>,
     /// The part of every batch that is loaded, and the number of parts.
-    part: [usize; 2],
+    pub part: [usize; 2],
 }
 
 /// The rows of part `part`, if `parts` parts share `count` rows evenly.
 pub fn share([part, parts]: [usize; 2], count: usize) -> Range<usize> {
     part * count / parts..(part + 1) * count / parts
-}
-
-impl<I: 'static> Loader<I> {
-    /// Batches of `batch` items, loaded by `workers` threads. At most `workers + prefetch` batches are loaded before
-    /// they are taken. The last batch may be smaller.
-    ///
-    /// # Panics
-    /// If `batch` or `workers` is 0.
-    pub fn new(dataset: impl Dataset<I> + 'static, batch: usize, workers: usize, prefetch: usize) -> Self {
-        assert!(batch > 0 && workers > 0, "{batch} items by {workers} workers");
-        Self { dataset: Arc::new(dataset), batch, workers, prefetch, shuffle: None, part: [0, 1] }
-    }
-
-    /// Loads only part number `part`, of `parts`, of every batch.
-    ///
-    /// # Panics
-    /// If `part` is not below `parts`.
-    pub fn part(mut self, part: usize, parts: usize) -> Self {
-        assert!(part < parts, "part {part} of {parts}");
-        self.part = [part, parts];
-        self
-    }
-
-    /// Loads items in a random order, which differs in every pass.
-    pub fn shuffled(mut self, seed: u64) -> Self {
-        self.shuffle = Some(seed);
-        self
-    }
 }
 
 type Loaded<I> = Result<Vec<I>, DatasetError>;
@@ -170,7 +146,12 @@ mod tests {
     fn loader(count: usize, workers: usize, broken: Option<usize>) -> (Loader<Held>, Arc<AtomicUsize>) {
         let most = Arc::new(AtomicUsize::new(0));
         let numbers = Numbers { count, broken, alive: Arc::default(), most: most.clone() };
-        (Loader::new(numbers, 4, workers, 2), most)
+        let dataset = Arc::new(numbers);
+        (Loader { dataset, batch: 4, workers, prefetch: 2, shuffle: None, part: [0, 1] }, most)
+    }
+
+    fn shuffled(workers: usize, part: [usize; 2]) -> Loader<Held> {
+        Loader { shuffle: Some(7), part, ..loader(50, workers, None).0 }
     }
 
     fn order(batches: Batches<Held>) -> Vec<usize> {
@@ -187,18 +168,14 @@ mod tests {
             let (loader, _) = loader(103, workers, None);
             assert_eq!(order(loader.batches(0, 0)), (0..103).collect::<Vec<_>>());
         }
-        let shuffled = |workers: usize| {
-            let loader = loader(50, workers, None).0.shuffled(7);
-            [0, 1].map(|pass| order(loader.batches(pass, 0)))
-        };
-        let [first, second] = shuffled(1);
-        let rest = loader(50, 3, None).0.shuffled(7).batches(1, 5);
-        assert_eq!(order(rest), second[20..]);
+        let passes = |workers: usize| [0, 1].map(|pass| order(shuffled(workers, [0, 1]).batches(pass, 0)));
+        let [first, second] = passes(1);
+        assert_eq!(order(shuffled(3, [0, 1]).batches(1, 5)), second[20..]);
         assert_eq!(loader(50, 2, None).0.batches(0, 13).count(), 0);
-        assert_eq!([first.clone(), second.clone()], shuffled(3));
+        assert_eq!([first.clone(), second.clone()], passes(3));
         // Parts of batches of 4, the last of which has 2.
-        let parts = [0, 1, 2].map(|part| loader(50, 2, None).0.shuffled(7).part(part, 3).batches(0, 0));
-        let mut parts = parts.map(|batches| batches.map(order_of).collect::<Vec<_>>());
+        let batches = |part: usize| shuffled(2, [part, 3]).batches(0, 0);
+        let mut parts = [0, 1, 2].map(|part| batches(part).map(order_of).collect::<Vec<_>>());
         let joined: Vec<usize> = (0..13)
             .flat_map(|batch| parts.each_mut().map(|part| std::mem::take(&mut part[batch])).concat())
             .collect();
