@@ -120,16 +120,8 @@ pub fn train<T: Task>(
     })
 }
 
-/// Measured times of a training.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Rehearsal {
-    /// Mean time of a step, without the first steps.
-    pub step: Duration,
-    /// Time of a validation, if the run has validations.
-    pub validation: Option<Duration>,
-}
-
-/// Makes a few steps without writing anything, and measures the last of them.
+/// Makes a few steps without writing anything. Returns the mean time of a step, without the first ones, and the time of a
+/// validation, if the run has validations.
 ///
 /// # Errors
 /// As [`train`].
@@ -139,7 +131,7 @@ pub fn rehearse<T: Task>(
     networks: Networks,
     device: &Device,
     ranks: &Ranks,
-) -> Result<Rehearsal> {
+) -> Result<(Duration, Option<Duration>)> {
     /// First steps, which allocate memory and compile GPU kernels, and measured steps.
     const STEPS: [u32; 2] = [5, 5];
     let mut learner = Learner::new(task, config, networks, device, ranks);
@@ -156,7 +148,7 @@ pub fn rehearse<T: Task>(
     let step = start.elapsed() / STEPS[1];
     let start = Instant::now();
     let validation = task.validate(&learner.averaged(), ranks)?.map(|_| start.elapsed());
-    Ok(Rehearsal { step, validation })
+    Ok((step, validation))
 }
 
 struct Session<'a, T: Task> {

@@ -6,7 +6,7 @@ use burn::tensor::Device;
 use indicatif::ProgressBar;
 use snapsnap_train::config::TrainConfig;
 use snapsnap_train::log::Line;
-use snapsnap_train::run::{Rehearsal, Watch};
+use snapsnap_train::run::Watch;
 use snapsnap_train::task::Validation;
 
 use crate::{device, memory, progress, say};
@@ -105,10 +105,10 @@ fn clock(seconds: f64) -> String {
     format!("{}:{:02}:{:02}", seconds / 3600, seconds / 60 % 60, seconds % 60)
 }
 
-/// Prints the time and memory that a run would take.
-pub fn rehearsed(config: &TrainConfig, on: &Device, rehearsal: Rehearsal) {
+/// Prints the time and memory that a run would take, from the times of a step and a validation.
+pub fn rehearsed(config: &TrainConfig, on: &Device, (step, validation): (Duration, Option<Duration>)) {
     let t = &config.training;
-    let step = rehearsal.step.as_secs_f64();
+    let step = step.as_secs_f64();
     let samples = t.batch as f64;
     say::out(&format!(
         "device {}: a step of {samples} samples takes {:.3} s, {:.1} samples a second",
@@ -117,7 +117,7 @@ pub fn rehearsed(config: &TrainConfig, on: &Device, rehearsal: Rehearsal) {
         samples / step
     ));
     let mut total = step * t.steps as f64;
-    if let Some(validation) = rehearsal.validation {
+    if let Some(validation) = validation {
         let count = 1 + t.steps.checked_div(t.validate_every).unwrap_or(0);
         total += validation.as_secs_f64() * count as f64;
         say::out(&format!("a validation takes {:.1} s; there will be {count}", validation.as_secs_f64()));
