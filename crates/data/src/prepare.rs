@@ -9,9 +9,7 @@ use serde::{Deserialize, Serialize};
 use snapsnap_splat::{Camera, Orbit};
 
 use crate::JitterConfig;
-use crate::dataset::{
-    Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Made, Split,
-};
+use crate::dataset::{Arrangement, Description, Drawn, Folder, Layout, MAX_RESOLUTION, MAX_VIEWS, Split};
 use crate::light::LightConfig;
 use snapsnap_base::config::{Schema, outside};
 use snapsnap_base::{FileError, random};
@@ -205,12 +203,13 @@ impl DataConfig {
         Ok(Arc::new(folder))
     }
 
-    /// Renders a subject and adds it to the data set. `mesh` stands on the floor at the origin.
+    /// Renders a subject and adds it to the data set. `mesh` stands on the floor at the origin. The result is false if
+    /// another run is writing the subject.
     ///
     /// # Errors
     /// [`FileError`] if the mesh cannot be rendered or is outside a view (the error names the subject's origin), or if
     /// a file cannot be written.
-    pub fn add(&self, folder: &Folder, subject: &Subject, mesh: &Mesh) -> Result<Made, FileError> {
+    pub fn add(&self, folder: &Folder, subject: &Subject, mesh: &Mesh) -> Result<bool, FileError> {
         let Subject { split, name, identity, yaw_degrees, origin } = *subject;
         let renderer = Renderer::new(mesh).map_err(|e| FileError::unsuitable(origin, e))?;
         let cameras = self.cameras(yaw_degrees, identity);

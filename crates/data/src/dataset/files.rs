@@ -13,7 +13,7 @@ use snapsnap_splat::{Camera, RigidTransform};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-use super::{MAX_RESOLUTION, Stored};
+use super::MAX_RESOLUTION;
 use snapsnap_base::FileError;
 use snapsnap_mesh::picture::{MAX_BYTES, decode_bytes, unreadable};
 use snapsnap_mesh::view::View;
@@ -125,7 +125,7 @@ fn holds_its_shape(npy: &[u8]) -> bool {
 type Depth = (Vec<f32>, [u32; 2]);
 
 /// Reads a file of [`write_inverse_depth`].
-pub fn read_inverse_depth(Stored { path, bytes }: &Stored) -> Result<Depth, FileError> {
+pub fn read_inverse_depth(path: &Path, bytes: &[u8]) -> Result<Depth, FileError> {
     let picture = decode_bytes(path, bytes, MAX_BYTES)?;
     if picture.color() != image::ColorType::L16 {
         let message = format!("is {:?}, expected 16-bit grey: inverse depth", picture.color());
@@ -153,7 +153,7 @@ pub fn write_depth(path: &Path, [height, width]: [usize; 2], depth: &[f32]) -> R
 }
 
 /// Reads a file of [`write_depth`].
-pub fn read_depth(Stored { path, bytes }: &Stored) -> Result<Depth, FileError> {
+pub fn read_depth(path: &Path, bytes: &[u8]) -> Result<Depth, FileError> {
     let wrong = |e: &dyn std::fmt::Display| FileError::unsuitable(path, format!("is no depth map: {e}"));
     let mut archive = ZipArchive::new(Cursor::new(bytes)).map_err(|e| wrong(&e))?;
     let entry = archive.by_name(&format!("{DEPTH}.npy")).map_err(|e| wrong(&e))?;
@@ -185,9 +185,16 @@ pub fn write_camera(folder: &Path, view: usize, camera: &Camera) -> Result<(), F
     save("extrinsic", ndarray::arr2(&extrinsic))
 }
 
-/// Reads the files of [`write_camera`]. The authors' tools store some matrices in f32.
-pub fn read_camera(intrinsic: &Stored, extrinsic: &Stored, side: u32) -> Result<Camera, FileError> {
-    let load = |Stored { path, bytes }: &Stored, shape: (usize, usize)| {
+/// Reads the files of [`write_camera`] with `read`. The authors' tools store some matrices in f32.
+pub fn read_camera(
+    folder: &Path,
+    view: usize,
+    side: u32,
+    read: impl Fn(&Path) -> Result<Vec<u8>, FileError>,
+) -> Result<Camera, FileError> {
+    let load = |name: &str, shape: (usize, usize)| {
+        let path = &folder.join(format!("{view}_{name}.npy"));
+        let bytes = &read(path)?;
         let matrix =
             read_array(bytes).or_else(|e| read_array::<f32>(bytes).map(|m| m.mapv(f64::from)).map_err(|_| e));
         let matrix = matrix.map_err(|e| FileError::unsuitable(path, format!("is no matrix: {e}")))?;
@@ -201,8 +208,8 @@ pub fn read_camera(intrinsic: &Stored, extrinsic: &Stored, side: u32) -> Result<
         }
         Ok(matrix)
     };
-    let k = load(intrinsic, (3, 3))?;
-    let e = load(extrinsic, (3, 4))?;
+    let k = load("intrinsic", (3, 3))?;
+    let e = load("extrinsic", (3, 4))?;
     let row = |row: usize| DVec3::new(e[[row, 0]], e[[row, 1]], e[[row, 2]]);
     let rotation = DMat3::from_cols(row(0), row(1), row(2)).transpose();
     let translation = DVec3::new(e[[0, 3]], e[[1, 3]], e[[2, 3]]);

@@ -37,7 +37,6 @@ pub use description::{Arrangement, Description, Drawn, Layout, MAX_RESOLUTION, M
 use snapsnap_mesh::picture;
 pub(crate) use views::centres;
 pub use views::{DepthMap, Person};
-pub use write::Made;
 
 /// Largest file of a data set that is read.
 const MAX_FILE: u64 = 1 << 30;
@@ -52,13 +51,6 @@ const MAX_DEPTH: usize = 3;
 pub struct Folder {
     root: PathBuf,
     description: Description,
-}
-
-/// A file that was read.
-struct Stored {
-    /// Path for messages.
-    path: PathBuf,
-    bytes: Vec<u8>,
 }
 
 impl Folder {
@@ -165,9 +157,8 @@ impl Folder {
     }
 
     /// Reads a file of the data set.
-    fn stored(&self, path: &Path) -> Result<Stored, FileError> {
-        let bytes = file::read(path, self.largest()).map_err(FileError::read(path))?;
-        Ok(Stored { path: path.to_owned(), bytes })
+    fn bytes(&self, path: &Path) -> Result<Vec<u8>, FileError> {
+        file::read(path, self.largest()).map_err(FileError::read(path))
     }
 
     /// Largest size of a file in bytes: enough for all cameras, and for 16 bytes per pixel at twice the side.

@@ -8,7 +8,7 @@ use image::{DynamicImage, GrayImage, RgbImage};
 use snapsnap_base::FileError;
 use snapsnap_splat::{Camera, RigidTransform, camera_file};
 
-use super::{Folder, Layout, Split, Stored, files};
+use super::{Folder, Layout, Split, files};
 use snapsnap_mesh::picture::{MAX_BYTES, decode_bytes};
 
 /// A person of a data set.
@@ -66,11 +66,10 @@ impl Person<'_> {
             Layout::Authors => files::read_inverse_depth,
             Layout::Exact => files::read_depth,
         };
-        let stored = self.folder.stored(&path)?;
-        let (depth, [height, width]) = read(&stored)?;
-        self.check_size(&stored.path, (width, height), 1)?;
+        let (depth, [height, width]) = read(&path, &self.folder.bytes(&path)?)?;
+        self.check_size(&path, (width, height), 1)?;
         if let Some(z) = depth.iter().find(|z| !z.is_finite() || **z < 0.0) {
-            return Err(FileError::unsuitable(&stored.path, format!("holds a depth of {z}")));
+            return Err(FileError::unsuitable(&path, format!("holds a depth of {z}")));
         }
         Ok(depth)
     }
@@ -104,8 +103,7 @@ impl Person<'_> {
     pub(super) fn file(&self, view: usize, high_resolution: bool) -> Result<DynamicImage, FileError> {
         let (suffix, times) = if high_resolution { ("_hr", 2) } else { ("", 1) };
         let path = self.picture_path(format_args!("{view}{suffix}"));
-        let Stored { path, bytes } = self.folder.stored(&path)?;
-        let picture = decode_bytes(&path, &bytes, MAX_BYTES)?;
+        let picture = decode_bytes(&path, &self.folder.bytes(&path)?, MAX_BYTES)?;
         self.check_size(&path, (picture.width(), picture.height()), times)?;
         Ok(picture)
     }
@@ -113,8 +111,7 @@ impl Person<'_> {
     /// The mask file of a view in the authors' layout.
     pub(super) fn mask(&self, view: usize) -> Result<GrayImage, FileError> {
         let path = self.path("mask").join(self.folder.file_name("mask", view));
-        let Stored { path, bytes } = self.folder.stored(&path)?;
-        let mask = decode_bytes(&path, &bytes, MAX_BYTES)?.into_luma8();
+        let mask = decode_bytes(&path, &self.folder.bytes(&path)?, MAX_BYTES)?.into_luma8();
         self.check_size(&path, mask.dimensions(), 1)?;
         Ok(mask)
     }
@@ -127,16 +124,15 @@ impl Person<'_> {
         let folder = self.folder;
         match folder.description.layout {
             Layout::Authors => {
-                let path = self.path("parm");
-                let matrix = |name: &str| folder.stored(&path.join(format!("{view}_{name}.npy")));
-                let intrinsic = matrix("intrinsic")?;
-                let side = folder.description.resolution;
-                let camera = files::read_camera(&intrinsic, &matrix("extrinsic")?, side)?;
-                camera.check().map_err(|problem| FileError::unsuitable(&intrinsic.path, problem))?;
+                let (path, side) = (self.path("parm"), folder.description.resolution);
+                let camera = files::read_camera(&path, view, side, |path| folder.bytes(path))?;
+                let path = path.join(format!("{view}_intrinsic.npy"));
+                camera.check().map_err(|problem| FileError::unsuitable(&path, problem))?;
                 Ok(camera)
             }
             Layout::Exact => {
-                let Stored { path, bytes } = folder.stored(&self.path("cameras"))?;
+                let path = self.path("cameras");
+                let bytes = folder.bytes(&path)?;
                 let text = std::str::from_utf8(&bytes)
                     .map_err(|_| FileError::unsuitable(&path, "is no text (UTF-8)"))?;
                 let cameras = camera_file::parse(&path, text)?;

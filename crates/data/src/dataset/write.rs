@@ -14,15 +14,6 @@ use snapsnap_mesh::view::View;
 /// Folder of unfinished subjects in the data set's root.
 pub(super) const UNFINISHED: &str = ".unfinished";
 
-/// Outcome of a write.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Made {
-    /// The subject is complete.
-    Whole,
-    /// Another run is writing the subject.
-    Elsewhere,
-}
-
 impl Folder {
     /// Whether the subject is complete: the last view has a file of every kind.
     pub fn has(&self, split: Split, subject: &str) -> bool {
@@ -41,7 +32,8 @@ impl Folder {
 
     /// Adds a subject from the source `origin`. `cameras` have the data set's resolution and pixel centres. `draw`
     /// renders a camera's view with pixel centres at +½; for `high_resolution` it is called again at twice the side.
-    /// The subject appears when all files are written. Several runs may write into one data set at once.
+    /// The subject appears when all files are written. Several runs may write into one data set at once: the result is
+    /// false if another run is writing the subject.
     ///
     /// # Errors
     /// [`FileError::Write`]; [`FileError::Unsuitable`] for a name that is no file name, an empty view, or, in the
@@ -56,7 +48,7 @@ impl Folder {
         origin: &Path,
         cameras: &[Camera],
         draw: impl Fn(&Camera) -> View + Sync,
-    ) -> Result<Made, FileError> {
+    ) -> Result<bool, FileError> {
         let description = &self.description;
         assert_eq!(cameras.len(), description.views, "cameras");
         let side = description.resolution;
@@ -74,12 +66,12 @@ impl Folder {
         let lock = fs::File::create(&mark).map_err(FileError::write(&mark))?;
         // Some file systems have no locks. Two runs may then write the same subject.
         if matches!(lock.try_lock(), Err(TryLockError::WouldBlock)) {
-            return Ok(Made::Elsewhere);
+            return Ok(false);
         }
         let mark = file::unfinished_file(&mark);
         if self.has(split, subject) {
             mark.remove();
-            return Ok(Made::Whole);
+            return Ok(true);
         }
         // Files of a killed run.
         match fs::remove_dir_all(&temporary) {
@@ -93,7 +85,7 @@ impl Folder {
         let _ = fs::remove_dir_all(&temporary);
         drop(guard);
         mark.remove();
-        made.map(|()| Made::Whole)
+        made.map(|()| true)
     }
 
     /// Removes the files of killed runs. Files of runs in progress stay.

@@ -14,7 +14,7 @@ use snapsnap_base::config::Schema;
 use snapsnap_base::file;
 use snapsnap_base::random::stream;
 use snapsnap_data::Shard;
-use snapsnap_data::dataset::{self, Folder, Made, Split};
+use snapsnap_data::dataset::{self, Folder, Split};
 use snapsnap_data::prepare::{DataConfig, Subject};
 use snapsnap_data::scan::{Collection, normalise};
 use snapsnap_mesh::mesh::Mesh;
@@ -207,8 +207,7 @@ fn make(
             config.add(&folder, &subject, &mesh)
         });
         match made {
-            Ok(Made::Whole) => {}
-            Ok(Made::Elsewhere) => elsewhere += 1,
+            Ok(is_whole) => elsewhere += u32::from(!is_whole),
             // The program is ending, which causes errors of subjects.
             Err(_) if file::is_ending() => std::thread::sleep(Duration::from_secs(60)),
             // The next subjects could not be written either.
