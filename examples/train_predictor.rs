@@ -28,8 +28,9 @@ use snapsnap_people::{Detail, synth};
 use snapsnap_train::gradients;
 use snapsnap_train::networks::Networks;
 use snapsnap_train::optimizer::{MuonSettings, OptimizerConfig};
-use snapsnap_train::points::{Losses, losses};
+use snapsnap_train::points::losses;
 use snapsnap_train::schedule::Schedule;
+use snapsnap_train::task::Part;
 
 /// A small convolutional body on a canvas of 64².
 const NETWORK: &str = r#"
@@ -74,19 +75,19 @@ fn data_set(root: &Path, resolution: usize) -> Result<Arc<Folder>, FileError> {
 }
 
 /// The losses of these samples.
-fn compare(networks: &Networks, config: &Config, items: Vec<Stage1Item>, device: &Device) -> Losses {
+fn compare(networks: &Networks, config: &Config, items: Vec<Stage1Item>, device: &Device) -> Vec<Part> {
     let predictor = networks.predictor.as_ref().expect("the predictor is trained");
     let batch = Stage1Batch::new(items, device);
     let mut record = Record::default();
     let masks = batch.masks.to_data().try_to_vec::<f32>().expect("numbers");
     let person = Window::around_person(&masks, config.network.resolution);
     let prediction = Prediction::new(predictor, config, batch.images, &batch.masks, person, &mut record);
-    losses(&prediction, &batch.points, &batch.valid, false)
+    losses(&prediction, &batch.points, &batch.valid, 0.0)
 }
 
 /// Mean distance of predicted from true points over the four views, millimetres.
-fn millimetres(losses: &Losses) -> f32 {
-    1e3 * losses.regression.clone().into_scalar::<f32>() / View::ALL.len() as f32
+fn millimetres(losses: &[Part]) -> f32 {
+    1e3 * losses[0].value.clone().into_scalar::<f32>() / View::ALL.len() as f32
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -124,8 +125,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         if step % 20 == 0 {
             println!("step {step}: points {:.1} mm", millimetres(&losses));
         }
-        let loss = losses.regression + losses.confidence * 0.5;
-        let rows = gradients::collect(&networks, &mut loss.backward());
+        let loss = losses.into_iter().map(|part| part.value * part.weight).reduce(|sum, part| sum + part);
+        let rows = gradients::collect(&networks, &mut loss.expect("two parts").backward());
         let factor = gradients::clip_factor(gradients::norm(&rows), 1.0).ok_or("a gradient is not finite")?;
         let rows = optimizer.step(schedule.share(step, steps), &networks, rows, factor);
         networks = networks.with_rows(&rows);

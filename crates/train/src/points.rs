@@ -5,7 +5,6 @@ use burn::tensor::Tensor;
 use snapsnap_net::Prediction;
 use snapsnap_ops::{mean, mean_lengths};
 
-use crate::config::Stage1Config;
 use crate::task::Part;
 
 /// λ: the weight of the confidences' cross-entropy, as in the published code. The paper has 1.
@@ -16,35 +15,17 @@ const SPACINGS: [usize; 4] = [1, 2, 4, 8];
 /// probabilities have no gradient, since the gradient of log 0 is not finite.
 const MIN_PROBABILITY: f64 = 1.2e-38;
 
-/// The losses of stage 1.
-#[derive(Debug, Clone)]
-pub struct Losses {
-    /// Mean distance in metres per view, summed over the views: `[1]`.
-    pub regression: Tensor<1>,
-    /// Mean binary cross-entropy of the confidences per view, summed: `[1]`.
-    pub confidence: Tensor<1>,
-    /// Mean error in metres of the differences between pixels that are 1, 2, 4 and 8 apart, per view, summed: `[1]`; if
-    /// it was asked for.
-    pub relief: Option<Tensor<1>>,
-}
-
-impl Losses {
-    /// The losses with their weights.
-    pub fn parts(self, config: &Stage1Config) -> Vec<Part> {
-        let relief_weight = config.relief_weight;
-        let mut parts = vec![
-            Part { name: "points", weight: 1.0, value: self.regression },
-            Part { name: "confidence", weight: CONFIDENCE_WEIGHT, value: self.confidence },
-        ];
-        parts.extend(self.relief.map(|value| Part { name: "relief", weight: relief_weight, value }));
-        parts
-    }
-}
-
 /// The losses of predicted maps of the first V views. `points` `[B,V,S,S,3]` are the true points in metres in the front
 /// camera's frame, and `valid` `[B,V,S,S]`, 0 or 1, marks the pixels that have one. Confidences must be probabilities.
-/// The means are over the pixels of a sample, and then over the samples. `relief` asks for that loss.
-pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, relief: bool) -> Losses {
+/// The means are over the pixels of a sample, and then over the samples, summed over the views: the distance in metres,
+/// the binary cross-entropy of the confidences, and, unless `relief_weight` is 0, the error in metres of the differences
+/// between pixels that are 1, 2, 4 and 8 apart.
+pub fn losses(
+    prediction: &Prediction,
+    points: &Tensor<5>,
+    valid: &Tensor<4>,
+    relief_weight: f64,
+) -> Vec<Part> {
     let Prediction { window, maps } = prediction;
     let ([b, ..], h, w) = (points.dims(), window.rows.len(), window.columns.len());
     let mut regression = Vec::new();
@@ -57,7 +38,7 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
         let truth = truth.narrow(3, window.columns.start, w).reshape([b, h, w, 3]);
         // Invalid points may be 10⁸ metres or NaN. They do not reach the gradient, since they are not inside.
         let off = map.points.clone() - truth;
-        let offsets = if relief { offsets(h, w) } else { vec![[0, 0]] };
+        let offsets = if relief_weight > 0.0 { offsets(h, w) } else { vec![[0, 0]] };
         let lengths = mean_lengths(off, inside.clone(), &offsets);
         if offsets.len() > 1 {
             reliefs.push(lengths.clone().narrow(1, 1, offsets.len() - 1).mean());
@@ -70,8 +51,13 @@ pub fn losses(prediction: &Prediction, points: &Tensor<5>, valid: &Tensor<4>, re
         let entropy = inside * sure + outside * unsure;
         confidence.push(-mean(entropy));
     }
-    let sum = |parts: Vec<Tensor<1>>| Tensor::cat(parts, 0).sum();
-    Losses { regression: sum(regression), confidence: sum(confidence), relief: relief.then(|| sum(reliefs)) }
+    let parts = [
+        ("points", 1.0, regression),
+        ("confidence", CONFIDENCE_WEIGHT, confidence),
+        ("relief", relief_weight, reliefs),
+    ];
+    let parts = parts.into_iter().filter(|(.., values)| !values.is_empty());
+    parts.map(|(name, weight, values)| Part { name, weight, value: Tensor::cat(values, 0).sum() }).collect()
 }
 
 /// Pixel offsets: `0, 0` for the errors themselves, [`SPACINGS`] down and across for their differences.

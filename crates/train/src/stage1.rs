@@ -16,7 +16,7 @@ use snapsnap_net::{Prediction, Window};
 use snapsnap_ops::host;
 
 use crate::Result;
-use crate::config::{Stage1Config, TrainConfig};
+use crate::config::TrainConfig;
 use crate::data::Data;
 use crate::details;
 use crate::networks::Networks;
@@ -36,9 +36,8 @@ type Map = (usize, Vec<f32>, Vec<f32>);
 
 /// The training of the point predictor.
 pub struct PointTask {
+    config: TrainConfig,
     networks: Config,
-    losses: Stage1Config,
-    seed: u64,
     data: Data<Stage1Item>,
     /// With gradients.
     device: Device,
@@ -51,9 +50,8 @@ impl PointTask {
     /// [`TrainError`](crate::TrainError) if a data set cannot be used with this config.
     pub fn new(folders: &[Arc<Folder>], config: &TrainConfig, device: &Device) -> Result<Self> {
         Ok(Self {
+            config: config.clone(),
             networks: config.networks(),
-            losses: config.stage1.clone(),
-            seed: config.training.seed,
             data: Data::new(folders, config, &config.samples(), Stage1::new)?,
             device: device.clone(),
         })
@@ -95,13 +93,14 @@ impl Task for PointTask {
 
     fn losses(&self, networks: &Networks, items: Vec<Stage1Item>, at: Moment) -> Result<Vec<Part>> {
         let batch = Stage1Batch::new(items, &self.device);
-        if self.losses.only_details {
+        let weights = &self.config.stage1;
+        if weights.only_details {
             let predictor = networks.predictor.as_ref().expect("stage 1 trains the predictor");
-            return Ok(details::losses(predictor, &self.networks, &self.losses, &batch, self.seed, &at));
+            let seed = self.config.training.seed;
+            return Ok(details::losses(predictor, &self.networks, weights, &batch, seed, &at));
         }
         let prediction = self.predict(networks, &batch, at.extent);
-        let relief = self.losses.relief_weight > 0.0;
-        Ok(losses(&prediction, &batch.points, &batch.valid, relief).parts(&self.losses))
+        Ok(losses(&prediction, &batch.points, &batch.valid, weights.relief_weight))
     }
 
     fn validate(&self, networks: &Networks, ranks: &Ranks) -> Result<Option<Validation>> {

@@ -302,8 +302,9 @@ fn gradients_of_the_losses_are_finite_differences() {
             let window = Window { rows: 0..h, columns: 0..w };
             let maps = vec![(View::Front, PointMap { points, conf })];
             let prediction = Prediction { window, maps };
-            let losses = losses(&prediction, &truth, &valid, true);
-            losses.regression + losses.confidence * 0.5 + losses.relief.expect("was asked for")
+            let parts = losses(&prediction, &truth, &valid, 1.0);
+            assert_eq!(parts.len(), 3);
+            parts.into_iter().map(|part| part.value * part.weight).reduce(|a, b| a + b).expect("three parts")
         };
         check(&format!("stage 1, {name}"), &random(&[2, 4, h, w], -1.5..1.5, 3), [2, 4, h, w], stage1);
     }

@@ -88,12 +88,11 @@ fn stage_1_follows_the_authors_twenty_steps() {
             &prediction,
             &truth.reshape([1, 4, side, side, 3]),
             &masks.reshape([1, 4, side, side]),
-            false,
+            0.0,
         );
-        let got = [losses.regression.clone(), losses.confidence.clone()];
-        let [r, c] = got.map(|loss| f64::from(loss.into_scalar::<f32>()));
+        let [r, c] = [0, 1].map(|i| f64::from(losses[i].value.clone().into_scalar::<f32>()));
         worst = worst.max(off(r, reg[step])).max(off(c, conf[step]));
-        let loss = losses.regression + losses.confidence * 0.5;
+        let loss = losses[0].value.clone() + losses[1].value.clone() * 0.5;
         let rows = gradients::collect(&networks, &mut loss.backward());
         if step == 0 {
             let compared = compare_gradients(&named(&networks, &rows), &expected);

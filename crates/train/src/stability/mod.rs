@@ -20,6 +20,7 @@ use crate::optimizer::{BETA1, EPSILON, MUON_WEIGHT_DECAY, MuonSettings, Optimize
 use crate::points::losses;
 use crate::schedule::Schedule;
 use crate::stage2::photometric;
+use crate::task::Part;
 use snapsnap_net::Prediction;
 
 /// A short training of small networks.
@@ -104,10 +105,11 @@ fn point_loss(count: usize, device: &Device) -> Found {
     let prediction = Prediction { window: Window::whole(SIDE), maps: vec![(View::Front, map)] };
     let truth = Tensor::<5>::from_data(TensorData::new(truth, [1, 1, SIDE, SIDE, 3]), &device);
     let valid = Tensor::<4>::from_data(TensorData::new(valid, [1, 1, SIDE, SIDE]), &device);
-    let loss = losses(&prediction, &truth, &valid, true);
-    let all = loss.regression.clone() + loss.relief.expect("was asked for");
+    let parts: Result<[Part; 3], _> = losses(&prediction, &truth, &valid, 1.0).try_into();
+    let [distance, _, relief] = parts.expect("three parts").map(|part| part.value);
+    let all = distance.clone() + relief;
     let gradient = host(predicted.grad(&all.backward()).expect("tracked"));
-    let got = host(loss.regression)[0];
+    let got = host(distance)[0];
     let expected = if count > 0 { (0.4_f64 * 0.4 + 0.3 * 0.3 + 0.5 * 0.5).sqrt() } else { 0.0 };
     Found { value: Some(apart(got, expected)), ..Found::default() }
         .must(all_finite(&gradient), "a gradient is not finite")

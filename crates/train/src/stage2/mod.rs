@@ -22,7 +22,7 @@ use snapsnap_ops::{host, mean};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 
 use crate::Result;
-use crate::config::{Stage1Config, Stage2Config, TrainConfig};
+use crate::config::TrainConfig;
 use crate::data::Data;
 use crate::networks::Networks;
 use crate::points::losses as points_losses;
@@ -43,11 +43,8 @@ const WORST: f32 = 0.5;
 
 /// The training of the regressor on the points of a predictor, which is frozen or trained as well.
 pub struct GaussianTask {
-    config: Config,
-    loss_config: Stage2Config,
-    /// Weights of the point loss.
-    stage1: Stage1Config,
-    seed: u64,
+    config: TrainConfig,
+    networks: Config,
     /// The predictor, unless it is trained as well: in f32 for validations, in the training's precision for steps.
     frozen: Option<[PointPredictor; 2]>,
     data: Data<Stage2Item>,
@@ -78,10 +75,8 @@ impl GaussianTask {
         let in_both =
             |predictor: PointPredictor| [predictor.clone(), config.training.precision.lower(predictor)];
         Ok(Self {
-            config: config.networks(),
-            loss_config: config.stage2.clone(),
-            stage1: config.stage1.clone(),
-            seed: config.training.seed,
+            config: config.clone(),
+            networks: config.networks(),
             frozen: predictor.map(in_both),
             data,
             billboard_scores: OnceLock::new(),
@@ -100,13 +95,13 @@ impl GaussianTask {
             }
         };
         let photographs = item.photographs.each_ref();
-        Prediction::of_pair(predictor, &self.config, photographs, device, &mut Record::default())
+        Prediction::of_pair(predictor, &self.networks, photographs, device, &mut Record::default())
     }
 
     /// Gaussians of all views, for validations.
     fn whole(&self, networks: &Networks, item: &Stage2Item) -> Gaussians {
         let prediction = self.predict(networks, item, false);
-        gaussians(&self.config, networks, item, prediction, &Phase::new(false, 0), &self.inner)
+        gaussians(&self.networks, networks, item, prediction, &Phase::new(false, 0), &self.inner)
     }
 
     /// Scores of the billboard baseline: both photographs as flat cut-outs in the plane through the person's axis. Its
@@ -117,7 +112,7 @@ impl GaussianTask {
             return Ok(*scores);
         }
         let device = &self.inner;
-        let mut config = self.config.clone();
+        let mut config = self.networks.clone();
         config.mode.compat = false;
         config.network.on_rays = false;
         config.regressor.start = Some(RegressorStart::Geometric);
@@ -125,7 +120,7 @@ impl GaussianTask {
         let all = self.data.validated(ranks, |sums: &mut Scores, item| {
             let window = Window::whole(item.side);
             let map = |view: View| {
-                let points = anchors(view, self.config.network.pair_degrees, item.side, &window, device);
+                let points = anchors(view, config.network.pair_degrees, item.side, &window, device);
                 (view, PointMap { conf: Tensor::zeros([1, item.side, item.side], device), points })
             };
             let prediction = Prediction { maps: View::ALL.map(map).to_vec(), window: window.clone() };
@@ -158,11 +153,11 @@ impl Task for GaussianTask {
 
     fn losses(&self, networks: &Networks, items: Vec<Stage2Item>, at: Moment) -> Result<Vec<Part>> {
         let Moment { step, first, .. } = at;
-        let (phase, device) = (Phase::new(self.loss_config.curriculum, step), &self.device);
+        let (config, seed) = (&self.config.stage2, self.config.training.seed);
+        let (phase, device) = (Phase::new(config.curriculum, step), &self.device);
         let mut sums: BTreeMap<&'static str, (f64, Vec<Tensor<1>>)> = BTreeMap::new();
-        let config = &self.loss_config;
         for (place, item) in items.iter().enumerate() {
-            let mut random = stream(&format!("stage2/{}/{step}/{}", self.seed, first + place));
+            let mut random = stream(&format!("stage2/{seed}/{step}/{}", first + place));
             let count = item.target_cameras.len();
             // While only the Gaussians of the sides are drawn, the target is one of the sides: the last two.
             let first = if phase.views.start == 2 { count - 2 } else { 0 };
@@ -177,12 +172,11 @@ impl Task for GaussianTask {
                 let views = valid.len() / (side * side);
                 let points = Tensor::from_data(TensorData::new(points, [1, views, side, side, 3]), device);
                 let valid = Tensor::from_data(TensorData::new(valid, [1, views, side, side]), device);
-                let relief = self.stage1.relief_weight > 0.0;
-                let parts = points_losses(&prediction, &points, &valid, relief).parts(&self.stage1);
+                let parts = points_losses(&prediction, &points, &valid, self.config.stage1.relief_weight);
                 let value = parts.into_iter().map(|part| part.value * part.weight);
                 add("points", config.points_weight, value.reduce(|a, b| a + b).expect("there are points"));
             }
-            let gaussians = gaussians(&self.config, networks, item, prediction, &phase, device);
+            let gaussians = gaussians(&self.networks, networks, item, prediction, &phase, device);
             // A sample without a valid pixel has no picture, and counts as one without an error.
             if gaussians.is_empty() {
                 continue;
