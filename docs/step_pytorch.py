@@ -315,7 +315,7 @@ def main():
     predictor, images = body(a.side), torch.rand(2 * a.batch, CHANNELS, a.side, a.side)
     regressor, views = Regressor(), torch.rand(2, 6, a.side, a.side)
     networks = (("predictor", predictor, images), ("regressor", regressor, views))
-    ours = [a.program, str(a.seconds), str(a.side), str(a.batch), "whole", a.network]
+    ours = [a.program, str(a.seconds), str(a.side), str(a.batch), a.network]
     ours += ["wide"] if a.wide else []
     if a.only:
         [(network, x)] = [(network, x) for name, network, x in networks if name == a.only]

@@ -2,8 +2,8 @@
 //! (two views of 256²): `cargo bench --workspace --bench step`. `docs/step_pytorch.py` measures PyTorch.
 //!
 //! Arguments: seconds per measurement (20), side (256), batch (2); `tiny`, `default` or `full` for that folder of
-//! `configs`; `wide` for twice the default's widths; `bf16`; `whole` for no partly frozen networks; `predictor` or
-//! `regressor` for one network alone, so that the printed memory is its own.
+//! `configs`; `wide` for twice the default's widths; `bf16`; `predictor` or `regressor` for one network alone, so that the
+//! printed memory is its own.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -77,18 +77,7 @@ fn run(seconds: f64, side: usize, batch: usize) {
     let channels = config.network.input_channels();
     let images =
         Tensor::<4>::random([2 * batch, channels, side, side], Distribution::Uniform(-1.0, 1.0), &device);
-    // Layers before the first trained one have no backward pass.
-    for (what, trained) in [
-        ("all trained", ""),
-        ("decoders and heads trained", "dust3r.dec_,dust3r.decoder_embed,dust3r.downstream_,scale"),
-        ("heads trained", "dust3r.downstream_,scale"),
-        ("front head trained", "dust3r.downstream_head1"),
-        ("nothing trained", "nothing"),
-    ] {
-        if asked_for("regressor") || (!trained.is_empty() && asked_for("whole")) {
-            continue;
-        }
-        let masters = masters.clone().with_trained(&trained.split(',').collect::<Vec<_>>());
+    if !asked_for("regressor") {
         let grid = [side / config.network.patch; 2];
         let time = measure(seconds, || {
             let start = Instant::now();
@@ -97,13 +86,11 @@ fn run(seconds: f64, side: usize, batch: usize) {
             let raw = predictor.raw(&predictor.decode(predictor.encode(input)));
             let loss = Tensor::cat(raw.into_iter().map(|raw| raw.square().mean()).collect(), 0).sum();
             let forward = start.elapsed();
-            if trained != "nothing" {
-                black_box(GradientsParams::from_grads(loss.backward(), &masters));
-            }
+            black_box(GradientsParams::from_grads(loss.backward(), &masters));
             (forward, start.elapsed() - forward)
         });
         println!(
-            "predictor, {}, {what}, batch {batch}, {side}², {threads} threads: {time}{}",
+            "predictor, {}, batch {batch}, {side}², {threads} threads: {time}{}",
             precision.name(),
             peak()
         );

@@ -34,20 +34,19 @@ pub(crate) struct Parameter {
 pub type Rows = BTreeMap<String, Tensor<1>>;
 
 impl Networks {
-    /// The same networks, of which only the parameters whose names begin with one of `parts` are trained.
-    pub fn with_trained(self, parts: &[&str]) -> Self {
-        struct Freeze<'a>(&'a [&'a str]);
+    /// The same networks, of which only the parameters whose names begin with `part` are trained.
+    pub fn with_trained(self, part: &str) -> Self {
+        struct Freeze<'a>(&'a str);
         impl NamedMapper for Freeze<'_> {
             fn map<const D: usize>(
                 &mut self,
                 path: &ParameterPath,
                 param: Param<Tensor<D>>,
             ) -> Param<Tensor<D>> {
-                let name = path.name();
-                param.set_require_grad(self.0.iter().any(|part| name.starts_with(part)))
+                param.set_require_grad(path.name().starts_with(self.0))
             }
         }
-        self.map(&mut Freeze(parts))
+        self.map(&mut Freeze(part))
     }
 
     /// Visits all parameters.

@@ -138,7 +138,7 @@ fn points(arguments: &Arguments, ranks: &Ranks) -> Result<u8, Failure> {
             None => random_predictor(&networks, plan.config.training.seed, tracked),
         };
         let networks = Networks { predictor: Some(predictor), regressors: Vec::new() };
-        Ok(if plan.config.stage1.only_details { networks.with_trained(&[DETAILS]) } else { networks })
+        Ok(if plan.config.stage1.only_details { networks.with_trained(DETAILS) } else { networks })
     })
 }
 
