@@ -164,14 +164,7 @@ mod over_mpi {
             let own = i32::try_from(bytes.len()).expect("short texts");
             let world = SimpleCommunicator::world();
             world.all_gather_into(&own, &mut counts[..]);
-            let starts: Vec<i32> = counts
-                .iter()
-                .scan(0, |sum, count| {
-                    let start = *sum;
-                    *sum += count;
-                    Some(start)
-                })
-                .collect();
+            let starts: Vec<i32> = (0..self.size).map(|rank| counts[..rank].iter().sum()).collect();
             let mut all = vec![0_u8; counts.iter().sum::<i32>() as usize];
             let mut parts = PartitionMut::new(&mut all[..], counts.as_slice(), starts.as_slice());
             world.all_gather_varcount_into(bytes, &mut parts);

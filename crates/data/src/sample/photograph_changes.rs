@@ -59,17 +59,13 @@ impl PhotographChanges {
     /// The first invalid key, and why it is invalid.
     pub fn problem(&self) -> Option<(&'static str, String)> {
         // Photographs of a user come without masks, and only masks say where the frame cuts the person off.
-        let of_masks = [("mask", self.mask), ("cut", self.cut)];
-        if let Some((key, _)) =
-            of_masks.into_iter().find(|(_, value)| self.road == Road::User && *value != 0.0)
-        {
+        if self.road == Road::User && (self.mask != 0.0 || self.cut != 0.0) {
+            let key = if self.mask != 0.0 { "mask" } else { "cut" };
             return Some((key, "must be 0 with `photographs.road = \"user\"`, which uses no masks".into()));
         }
         if self.scene.is_some() && self.background.is_some() {
-            return Some((
-                "scene",
-                "must be unset with `photographs.background`: it is behind the person".into(),
-            ));
+            let message = "must be unset with `photographs.background`: it is behind the person";
+            return Some(("scene", message.into()));
         }
         let background = self.background.unwrap_or_default().map(|value| ("background", value, 0.0..=1.0));
         config::outside([
