@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use glam::{Mat3, Vec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 
 use crate::dataset::Split;
 use snapsnap_base::{FileError, folder};
@@ -20,25 +19,19 @@ pub const HEIGHT: f32 = 1.8;
 const HEIGHT_JITTER: f32 = 0.05;
 
 /// A collection of scans with its conventions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Collection {
     /// THuman2.0: subjects 0 to 525.
-    #[serde(rename = "thuman2.0")]
     Thuman20,
     /// THuman2.1: THuman2.0 and the subjects from 526 on.
-    #[serde(rename = "thuman2.1")]
     Thuman21,
     /// CustomHumans.
-    #[serde(rename = "customhumans")]
     CustomHumans,
     /// 2K2K.
-    #[serde(rename = "2k2k")]
     TwoK2K,
     /// 4D-Dress.
-    #[serde(rename = "4d-dress")]
     FourDDress,
     /// Other scans: y up, facing +z.
-    #[serde(rename = "other")]
     Other,
 }
 

@@ -9,12 +9,6 @@ pub struct Shard {
     count: usize,
 }
 
-impl Default for Shard {
-    fn default() -> Self {
-        Self { index: 0, count: 1 }
-    }
-}
-
 impl Shard {
     /// The shard in file names, such as `0-of-4`.
     pub fn name(self) -> String {

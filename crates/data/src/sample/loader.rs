@@ -40,8 +40,8 @@ pub struct Batches<I> {
     /// The channel of each worker. Workers load batches in turn.
     loaded: Vec<Receiver<Loaded<I>>>,
     workers: Vec<JoinHandle<()>>,
-    count: usize,
-    taken: usize,
+    /// Numbers of the batches that were not taken.
+    left: Range<usize>,
 }
 
 impl<I: Send + Sync + 'static> Loader<I> {
@@ -74,7 +74,7 @@ impl<I: Send + Sync + 'static> Loader<I> {
             (loaded, Builder::new().name(format!("loader-{worker}")).spawn(work).expect("a thread starts"))
         };
         let (loaded, workers) = (0..count).map(start).unzip();
-        Batches { loaded, workers, count: order.len().div_ceil(batch), taken: 0 }
+        Batches { loaded, workers, left: 0..order.len().div_ceil(batch) }
     }
 }
 
@@ -82,12 +82,8 @@ impl<I> Iterator for Batches<I> {
     type Item = Loaded<I>;
 
     fn next(&mut self) -> Option<Loaded<I>> {
-        if self.taken == self.count {
-            return None;
-        }
-        let loaded = self.loaded[self.taken % self.loaded.len()].recv().ok()?;
-        self.taken += 1;
-        Some(loaded)
+        let number = self.left.next()?;
+        self.loaded[number % self.loaded.len()].recv().ok()
     }
 }
 
