@@ -222,8 +222,8 @@ fn ends_of_the_rate() -> Found {
             let first = if warm_up == 0 { 1.0 } else { 1.0 / (warm_up as f64 + 1.0) };
             worst = worst.max((at(0) - first).abs());
             if steps > warm_up + 1 {
-                let ends = [(warm_up, 1.0), (steps - 1, 0.01), (10 * steps, 0.01)];
-                worst = ends.iter().map(|(step, rate)| (at(*step) - rate).abs()).fold(worst, f64::max);
+                let ends = [(warm_up, 1.0_f64), (steps - 1, 0.01), (10 * steps, 0.01)];
+                worst = ends.into_iter().map(|(step, rate)| (at(step) - rate).abs()).fold(worst, f64::max);
             }
             sound &=
                 [0, steps / 2, steps - 1, steps, 10 * steps].iter().all(|s| (0.0..=1.0).contains(&at(*s)));
