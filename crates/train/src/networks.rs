@@ -123,9 +123,7 @@ impl Networks {
                 path: &ParameterPath,
                 parameter: Param<Tensor<D>>,
             ) -> Param<Tensor<D>> {
-                let Some(row) = self.0.get(&path.name()) else {
-                    return parameter;
-                };
+                let Some(row) = self.0.get(&path.name()) else { return parameter };
                 let (id, old, mapper) = parameter.consume();
                 let device = old.clone().without_autodiff().device();
                 let values = row.clone().to_device(&device).reshape(old.shape());
