@@ -20,6 +20,8 @@ const GREY: f32 = 150.0 / 255.0;
 const LIKELY: f32 = 0.5;
 /// Distance between a ray and a landmark at which the ray has half of its weight, as a share of the person's longer side.
 const REACH: f32 = 0.03;
+/// Sum of the angles, radians, by which shoulders and hips are on the wrong side in a picture whose sides are exchanged.
+const SWAPPED: f32 = 0.02;
 /// Rounds of the weighted means.
 const ROUNDS: usize = 8;
 
@@ -103,7 +105,11 @@ fn look(camera: &Camera, rgb: &[f32]) -> Option<Vec<Ray>> {
         let seen = [visible, present, other_visible, other_present].map(probability);
         Ray { from, way: (turn * at.extend(1.0)).normalize(), seen: seen.into_iter().fold(1.0, f32::min) }
     };
-    Some((0..LANDMARKS).map(ray).collect())
+    let rays: Vec<Ray> = (0..LANDMARKS).map(ray).collect();
+    // The person faces +z, so the left is towards +x. The network sometimes takes a front for a back.
+    let across: f32 = [11, 23].iter().map(|left| (rays[*left].way - rays[left + 1].way).x).sum();
+    let is_swapped = across < -SWAPPED;
+    Some((0..LANDMARKS).map(|row| rays[if is_swapped { opposite(row) } else { row }]).collect())
 }
 
 /// The landmark of the other side of the body. The nose is 0; each eye has three landmarks.

@@ -55,15 +55,26 @@ impl Field {
         let counts = ((high - low) / cell).ceil().as_ivec3() + 2 * BORDER;
         let cells = counts.as_usizevec3().element_product();
         let mut field = Self { origin, cell, counts, rows: vec![NONE; cells], weights: Vec::new() };
-        let inside = field.inside(mesh);
-        inside.iter().enumerate().for_each(|(row, cell)| field.rows[*cell] = row as u32);
-        let nearest = field.nearest(&inside, sources);
-        if nearest.iter().all(|(_, length)| length.is_infinite()) {
+        let mut inside = field.inside(mesh);
+        field.number(&inside);
+        let mut nearest = field.nearest(&inside, sources);
+        // From cells of their own no way leads to a bone.
+        let mut reached = nearest.iter().map(|(_, length)| length.is_finite());
+        inside.retain(|_| reached.next().expect("one for each cell"));
+        nearest.retain(|(_, length)| length.is_finite());
+        if inside.is_empty() {
             return None;
         }
+        field.number(&inside);
         field.weights = field.heat(&inside, sources, &nearest, bones);
         field.extend();
         Some(field)
+    }
+
+    /// Gives the cells inside their rows, and no other one.
+    fn number(&mut self, inside: &[usize]) {
+        self.rows.fill(NONE);
+        inside.iter().enumerate().for_each(|(row, cell)| self.rows[*cell] = row as u32);
     }
 
     /// The weights at a place: those of the eight cells around it.
@@ -183,10 +194,7 @@ impl Field {
             .iter()
             .map(|cell| steps.map(|step| self.rows[self.index(self.place(*cell) + step)]))
             .collect();
-        let heat = |(_, length): &(usize, f32)| {
-            // A cell without a way to a bone has the weights of its neighbours.
-            HEAT * (self.cell / length.max(0.5 * self.cell)).powi(2)
-        };
+        let heat = |(_, length): &(usize, f32)| HEAT * (self.cell / length.max(0.5 * self.cell)).powi(2);
         let heats: Vec<f32> = nearest.iter().map(heat).collect();
         let share = |bone: usize, (source, length): (usize, f32)| {
             let source = &sources[source];
