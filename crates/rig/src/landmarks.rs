@@ -3,7 +3,7 @@
 
 use burn::tensor::Tensor;
 use glam::{DVec2, Mat3, Vec3};
-use snapsnap_photo::segmenter::{SIDE, pose};
+use snapsnap_photo::segmenter::{Pose, SIDE, pose};
 use snapsnap_splat::scene::Loaded;
 use snapsnap_splat::{Camera, Orbit, RenderOptions, SplatError, render};
 
@@ -88,28 +88,31 @@ fn view(
 
 /// The rays of the landmarks in a picture: means of the picture and of its mirror image.
 fn look(camera: &Camera, rgb: &[f32]) -> Option<Vec<Ray>> {
-    let mut mirrored = rgb.to_vec();
-    mirrored.chunks_exact_mut(SIDE).for_each(<[f32]>::reverse);
-    let [plain, mirrored] = [rgb, &mirrored].map(pose);
-    if plain.presence.min(mirrored.presence) < LIKELY {
-        return None;
-    }
-    let probability = |logit: f32| 1.0 / (1.0 + (-logit).exp());
     let from = camera.centre().as_vec3();
     let turn = camera.world_to_camera.rotation.transpose().as_mat3();
-    let ray = |row: usize| {
-        let [x, y, _, visible, present] = plain.landmarks[row];
-        let [other_x, other_y, _, other_visible, other_present] = mirrored.landmarks[opposite(row)];
-        let at = 0.5 * DVec2::new(f64::from(x + SIDE as f32 - other_x), f64::from(y + other_y));
-        let at = ((at - camera.principal_point) / camera.focal).as_vec2();
-        let seen = [visible, present, other_visible, other_present].map(probability);
-        Ray { from, way: (turn * at.extend(1.0)).normalize(), seen: seen.into_iter().fold(1.0, f32::min) }
-    };
-    let rays: Vec<Ray> = (0..LANDMARKS).map(ray).collect();
-    // The person faces +z, so the left is towards +x. The network sometimes takes a front for a back.
-    let across: f32 = [11, 23].iter().map(|left| (rays[*left].way - rays[left + 1].way).x).sum();
-    let is_swapped = across < -SWAPPED;
-    Some((0..LANDMARKS).map(|row| rays[if is_swapped { opposite(row) } else { row }]).collect())
+    let mut mirrored = rgb.to_vec();
+    mirrored.chunks_exact_mut(SIDE).for_each(<[f32]>::reverse);
+    let looks = [(rgb, false), (&mirrored, true)].map(|(rgb, is_mirrored)| {
+        let Pose { landmarks, presence, .. } = pose(rgb);
+        let probability = |logit: f32| 1.0 / (1.0 + (-logit).exp());
+        let ray = |row: usize| {
+            let [x, y, _, visible, present] = landmarks[if is_mirrored { opposite(row) } else { row }];
+            let x = if is_mirrored { SIDE as f32 - x } else { x };
+            let at = (DVec2::new(x.into(), y.into()) - camera.principal_point) / camera.focal;
+            let way = (turn * at.as_vec2().extend(1.0)).normalize();
+            Ray { from, way, seen: probability(visible).min(probability(present)) }
+        };
+        let rays: Vec<Ray> = (0..LANDMARKS).map(ray).collect();
+        // The person faces +z, so the left is towards +x. The network sometimes takes a front for a back.
+        let across: f32 = [11, 23].iter().map(|left| (rays[*left].way - rays[left + 1].way).x).sum();
+        let is_swapped = across < -SWAPPED;
+        let row = |row: usize| rays[if is_swapped { opposite(row) } else { row }];
+        (presence >= LIKELY).then(|| (0..LANDMARKS).map(row).collect::<Vec<_>>())
+    });
+    let [Some(plain), Some(mirrored)] = looks else { return None };
+    let mean =
+        |(a, b): (&Ray, &Ray)| Ray { way: (a.way + b.way).normalize(), seen: a.seen.min(b.seen), ..*a };
+    Some(plain.iter().zip(&mirrored).map(mean).collect())
 }
 
 /// The landmark of the other side of the body. The nose is 0; each eye has three landmarks.
