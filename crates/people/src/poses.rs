@@ -16,7 +16,7 @@ use crate::skeleton::{Name, hanging, known, need};
 const MAX_BYTES: u64 = 64 << 20;
 /// Largest number of joints and of frames that are read.
 const MAX_JOINTS: usize = 4096;
-const MAX_FRAMES: usize = 4096;
+const MAX_FRAMES: usize = 65_536;
 /// Largest lean of the trunk and bend of a knee of a standing person, degrees.
 const LEAN: f32 = 30.0;
 const KNEE: f32 = 60.0;
@@ -217,12 +217,15 @@ fn parse(text: &str) -> Result<Motion, String> {
     }
     expect(words.next(), "Frames:")?;
     let frames: usize = words.next().and_then(|word| word.parse().ok()).ok_or("has no number of frames")?;
+    if frames > MAX_FRAMES {
+        return Err(format!("has more than {MAX_FRAMES} frames"));
+    }
     expect(words.next(), "Frame")?;
     expect(words.next(), "Time:")?;
     let step = number(words.next())?;
     let skeleton = Rows::find(joints.iter().map(|joint| &*joint.name))?;
     let mut poses = Vec::new();
-    for _ in 0..frames.min(MAX_FRAMES) {
+    for _ in 0..frames {
         let mut turns: Vec<Mat3> = Vec::with_capacity(joints.len());
         let mut places: Vec<Vec3> = Vec::with_capacity(joints.len());
         for joint in &joints {
@@ -443,6 +446,28 @@ mod tests {
         }
         for end in (0..sound.len() - 90).step_by(37) {
             assert!(parse(&sound[..end]).is_err(), "{end}");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn motions_end_as_they_begin_and_never_leap() {
+        for name in MOTIONS {
+            let poses = Motion::named(name).expect("a motion of this name").poses;
+            let angles = |pose: &Pose| {
+                [&pose.trunk[..], &pose.head, pose.arms.as_flattened(), pose.legs.as_flattened()].concat()
+            };
+            let apart = |a: &Pose, b: &Pose| {
+                angles(a).iter().zip(angles(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+            };
+            assert!(apart(&poses[0], &poses[poses.len() - 1]) < 1e-3, "{name}");
+            // Degrees in a thirtieth of a second.
+            let fastest = poses.windows(2).map(|pair| apart(&pair[0], &pair[1])).fold(0.0, f32::max);
+            assert!(fastest < 15.0, "{name}: {fastest}");
         }
     }
 }

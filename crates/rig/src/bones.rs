@@ -9,7 +9,7 @@ use crate::weights::Source;
 
 /// A joint or an end of a limb: its name, its parent, the landmarks whose mean it starts from, the landmarks between which
 /// the limb leads, and its distance from the mean: left, up and forwards along the trunk, and along the limb, in lengths
-/// of the trunk. Distances are medians over 60 people of MakeHuman's data (docs/method.md, "Skeletons").
+/// of the trunk. Distances are fits to 60 people of MakeHuman's data (docs/method.md, "Skeletons").
 type Row = (&'static str, &'static str, &'static [usize], Option<[usize; 2]>, [f32; 4]);
 const TRUNK: [Row; 6] = [
     ("Hips", "", &[23, 24], None, [0.0, 0.06, -0.1, 0.0]),
@@ -45,6 +45,9 @@ const SURE: f32 = 0.2;
 const THIGH: f32 = 0.24;
 const CALF: f32 = 0.2;
 
+/// Parts of the left limbs: the landmarks of both ends, and the last landmark of the limb.
+const PARTS: [(usize, usize, usize); 4] = [(11, 13, 21), (13, 15, 21), (23, 25, 31), (25, 27, 31)];
+
 /// A bone of a person.
 #[derive(Debug, Clone)]
 pub struct Bone {
@@ -65,8 +68,25 @@ impl Bone {
     }
 }
 
+/// The landmarks with limbs of the same lengths on both sides: their means, weighted by certainty.
+fn symmetric(landmarks: &[Landmark]) -> Vec<Landmark> {
+    let mut landmarks = landmarks.to_vec();
+    for (start, end, last) in PARTS {
+        let ways = [0, 1].map(|side| landmarks[end + side].at - landmarks[start + side].at);
+        let sure = [0, 1].map(|side| landmarks[start + side].sure * landmarks[end + side].sure);
+        let [left, right] = ways.map(|way| way.length().max(1e-6));
+        let length = (sure[0] * left + sure[1] * right) / (sure[0] + sure[1]).max(1e-6);
+        for (side, own) in [left, right].into_iter().enumerate() {
+            let step = (length / own - 1.0) * ways[side];
+            (end..=last).step_by(2).for_each(|row| landmarks[row + side].at += step);
+        }
+    }
+    landmarks
+}
+
 /// The bones of a person with these landmarks.
 pub fn bones(landmarks: &[Landmark]) -> Vec<Bone> {
+    let landmarks = symmetric(landmarks);
     let at = |row: usize| landmarks[row].at;
     let middle = |rows: &[usize]| rows.iter().map(|row| at(*row)).sum::<Vec3>() / rows.len() as f32;
     let (shoulders, hips) = (middle(&[11, 12]), middle(&[23, 24]));

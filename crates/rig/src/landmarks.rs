@@ -145,3 +145,23 @@ fn meet(rays: &[Ray], reach: f32) -> Landmark {
     }
     Landmark { at, sure: weights.iter().sum::<f32>() / rays.len() as f32 }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_ray_in_eight_that_misses_moves_no_landmark() {
+        let truth = Vec3::new(0.2, 1.1, -0.1);
+        let rays = YAWS.map(|yaw| {
+            let (sin, cos) = yaw.to_radians().sin_cos();
+            let from = Vec3::new(5.0 * sin as f32, 1.0, 5.0 * cos as f32);
+            let miss = if yaw == 90.0 { Vec3::new(0.0, 0.4, 0.3) } else { Vec3::ZERO };
+            Ray { from, way: (truth + miss - from).normalize(), seen: 0.9 }
+        });
+        let Landmark { at, sure } = meet(&rays, 0.05);
+        assert!(at.distance(truth) < 0.003 && (0.7..0.9).contains(&sure), "{at} {sure}");
+        let none = rays.map(|ray| Ray { seen: 0.0, ..ray });
+        assert!(meet(&none, 0.05).sure < 1e-2);
+    }
+}

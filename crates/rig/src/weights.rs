@@ -294,3 +294,64 @@ fn largest(mut sums: Vec<(u32, f32)>) -> Weights {
     weights.iter_mut().for_each(|(_, weight)| *weight /= sum.max(f32::MIN_POSITIVE));
     weights
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A closed mesh around cubes of 3 cm.
+    fn cubes(is_solid: impl Fn(IVec3) -> bool) -> Mesh {
+        let (mut positions, mut triangles) = (Vec::new(), Vec::new());
+        for cube in (0..40).flat_map(|x| (0..30).flat_map(move |y| (0..4).map(move |z| IVec3::new(x, y, z))))
+        {
+            for way in [IVec3::X, IVec3::Y, IVec3::Z].into_iter().flat_map(|way| [way, -way]) {
+                if is_solid(cube) && !is_solid(cube + way) {
+                    let outside = cube.as_vec3() + 0.5 + 0.5 * way.as_vec3();
+                    let (u, v) = way.as_vec3().any_orthonormal_pair();
+                    let first = positions.len() as u32;
+                    let corners = [u + v, v - u, -u - v, u - v];
+                    positions.extend(corners.map(|corner| 0.03 * (outside + 0.5 * corner)));
+                    triangles.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
+                }
+            }
+        }
+        let colors = vec![Vec3::ONE; positions.len()];
+        Mesh::colored(positions, colors, triangles)
+    }
+
+    /// Two legs, one cube apart from each other, below a trunk; and beside them a piece without a bone.
+    #[test]
+    fn heat_takes_no_way_through_the_air() {
+        let mesh = cubes(|IVec3 { x, y, z }| {
+            let is_body = if y < 20 { x != 2 } else { y < 24 };
+            let is_there = (0..2).contains(&z) && y >= 0;
+            is_there && (is_body && (0..5).contains(&x) || (20..24).contains(&x) && y < 4)
+        });
+        let source = |bone, ends: [[f32; 2]; 2]| Source {
+            bone,
+            ends: ends.map(|[x, y]| 0.03 * Vec3::new(x, y, 1.0)),
+            cloth: None,
+        };
+        let sources = [
+            source(0, [[2.5, 23.0], [2.5, 21.0]]),
+            source(1, [[1.0, 20.0], [1.0, 0.5]]),
+            source(2, [[4.0, 20.0], [4.0, 0.5]]),
+        ];
+        let field = Field::new(&mesh, &sources, 3).expect("bones within");
+        let share = |x: f32, y: f32, bone: u32| {
+            let weights = field.at(0.03 * Vec3::new(x, y, 1.0));
+            weights.iter().filter(|(row, _)| *row == bone).map(|(_, weight)| weight).sum::<f32>()
+        };
+        // The other leg is as near here as the own bone.
+        assert!(share(1.9, 10.0, 1) > 0.95 && share(1.9, 10.0, 2) < 0.01);
+        assert!(share(3.1, 10.0, 2) > 0.95 && share(3.1, 10.0, 1) < 0.01);
+        assert!(share(2.5, 23.0, 0) > 0.6);
+        // The hip is bent by both bones.
+        assert!((0.1..0.9).contains(&share(1.0, 20.0, 1)));
+        for (x, y) in (-2..30).flat_map(|x| (-2..30).map(move |y| (x as f32, y as f32))) {
+            let sum: f32 = (0..3).map(|bone| share(x, y, bone)).sum();
+            assert!((sum - 1.0).abs() < 1e-5, "{x} {y}: {sum}");
+        }
+        assert!(Field::new(&mesh, &[source(0, [[12.0, 2.0], [12.0, 3.0]])], 1).is_none());
+    }
+}

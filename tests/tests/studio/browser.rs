@@ -106,12 +106,23 @@ fn a_person_is_made_in_the_browser() {
     // Every download has the server's bytes.
     let links = page.value("[...document.querySelectorAll('#downloads a')].map((link) => link.href)");
     let links: Vec<String> = serde_json::from_value(links).expect("addresses");
-    assert_eq!(links.len(), 7);
+    assert_eq!(links.len(), 8);
     for link in &links[..5] {
         let size = page.value(&format!("fetch('{link}').then((a) => a.blob()).then((b) => b.size)"));
         let path = link.split_once(&server.port.to_string()).expect("an address").1;
         assert_eq!(size.as_u64(), Some(server.ask(&format!("GET {path}"), None).2.len() as u64), "{link}");
     }
+    // The person walks.
+    let picture = "snapsnap.screenshot().then((blob) => blob.arrayBuffer()).then((bytes) => \
+                   new Uint8Array(bytes).reduce((sum, byte) => (31 * sum + byte) | 0, 0))";
+    page.value(
+        "{ const motion = document.getElementById('motion'); motion.value = 'walk'; \
+         motion.dispatchEvent(new Event('input')); }",
+    );
+    page.wait("!document.getElementById('motion').disabled");
+    assert_eq!(page.value("document.getElementById('message').textContent"), "");
+    let stride = page.value(picture);
+    page.wait(&format!("{picture}.then((next) => next !== {stride})"));
     // The photographs are still there.
     page.value("document.getElementById('photographs').click()");
     assert_eq!(page.value(shown), true);

@@ -63,7 +63,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
             "mpi": cfg!(feature = "mpi"),
             "threads": threads(),
             "bf16": bf16::is_there(),
-            "memory_bytes": memory,
+            "memory_bytes": (memory < u64::MAX).then_some(memory),
             "devices": devices.iter().map(device).collect::<Vec<Value>>(),
             "chosen": chosen,
             "why": why,
@@ -192,6 +192,7 @@ fn threads() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
+/// Some systems do not tell their memory.
 fn gigabytes(bytes: u64) -> String {
-    format!("{:.1} GB", bytes as f64 / 1e9)
+    if bytes == u64::MAX { "unknown".into() } else { format!("{:.1} GB", bytes as f64 / 1e9) }
 }

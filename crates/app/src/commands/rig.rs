@@ -65,12 +65,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let inputs: Vec<&Path> = [input].into_iter().chain(pose).chain(motion).map(PathBuf::as_path).collect();
     check_outputs(&[output], &inputs)?;
     let pose = pose.as_deref().map(|pose| read_pose(pose, arguments.frame)).transpose()?;
-    let motions = motion.iter().map(|path| {
-        let own = path.to_str().and_then(Motion::named);
-        Ok((path, own.map_or_else(|| poses::read(path), Ok)?))
-    });
-    let motions: Result<Vec<_>, Failure> = motions.collect();
-    let motions = motions?;
+    let motions = motion.iter().map(|path| Ok((path, read_motion(path)?)));
+    let motions = motions.collect::<Result<Vec<_>, Failure>>()?;
 
     let scene = read(input)?.load(&device::choose(&arguments.device)?);
     let progress = Progress::stages();
@@ -114,6 +110,21 @@ pub fn skeleton(scene: &Loaded, mesh: &Mesh, name: &Path) -> Result<Rig, Failure
         ));
     }
     Ok(rig)
+}
+
+/// The motion that `--motion` names.
+fn read_motion(path: &Path) -> Result<Motion, Failure> {
+    if let Some(own) = path.to_str().and_then(Motion::named) {
+        return Ok(own);
+    }
+    let motion = poses::read(path)?;
+    if motion.poses.is_empty() {
+        return Err(Failure::file(path, "has no frames"));
+    }
+    if motion.step <= 0.0 {
+        return Err(Failure::file(path, "has no time between its frames"));
+    }
+    Ok(motion)
 }
 
 /// The pose that `--pose` names.

@@ -391,9 +391,10 @@ element("motion").addEventListener("input", async () => {
   } catch (error) {
     say(`No skeleton: ${error.message ?? error}`);
     element("motion").value = "";
+  } finally {
+    element("motion").disabled = false;
+    redraw();
   }
-  element("motion").disabled = false;
-  redraw();
 });
 
 // Number of consecutive frames, and their time in milliseconds.
