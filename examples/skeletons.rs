@@ -7,15 +7,16 @@
 //! cargo run --release --example skeletons -- people MAKEHUMAN_DATA makehuman/65/test
 //! ```
 //!
-//! Surfaces are aligned by a similarity (iterative closest points) before they and their joints are compared.
+//! A second row of errors has the joints of Gaussians on the true surface: what remains is the skeleton's own error. Surfaces are aligned by a similarity (iterative closest points) before they and their joints are compared.
 
 use std::env;
 use std::error::Error;
 use std::path::Path;
 use std::time::Instant;
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor, TensorData};
 use glam::Vec3;
+use rand::Rng;
 use snapsnap_base::random::stream;
 use snapsnap_eval::geometry::{Alignment, chamfer, icp, sampled};
 use snapsnap_mesh::fuse::{Options, fuse};
@@ -24,7 +25,8 @@ use snapsnap_mesh::mesh::Mesh;
 use snapsnap_people::makehuman::{Library, rigged};
 use snapsnap_people::{Detail, Pose};
 use snapsnap_rig::{Bone, Rig, pose_mesh};
-use snapsnap_splat::scene::Stored;
+use snapsnap_splat::Gaussians;
+use snapsnap_splat::scene::{Loaded, Stored};
 
 /// Bones of the left side by Mixamo's and by MakeHuman's names.
 const JOINTS: [(&str, &str); 6] = [
@@ -37,6 +39,8 @@ const JOINTS: [(&str, &str); 6] = [
 ];
 /// Points of a surface.
 const POINTS: usize = 20_000;
+/// Distance between Gaussians of a true surface, metres.
+const SPACING: f32 = 0.003;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = env::args().skip(1).collect();
@@ -44,7 +48,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         return Err("expected PEOPLE DATA IDENTITIES".into());
     };
     let library = Library::open(Path::new(data))?;
-    let (mut errors, mut uneven, mut surfaces) = (vec![Vec::new(); 6], Vec::new(), [Vec::new(), Vec::new()]);
+    let mut errors = [vec![Vec::new(); 6], vec![Vec::new(); 6]];
+    let (mut uneven, mut surfaces) = (Vec::new(), [Vec::new(), Vec::new()]);
     for index in 0.. {
         let path = Path::new(people).join(format!("{index:04}.ply"));
         if !path.exists() {
@@ -61,14 +66,18 @@ fn main() -> Result<(), Box<dyn Error>> {
         let truth = |pose| rigged(&library, &identity, None, pose, Detail::Coarse);
         let (true_mesh, true_bones) = truth(None)?;
         let (alignment, before) = compared(&mesh, &true_mesh)?;
-        let mut apart = [0.0; 6];
-        for (row, (ours, theirs)) in JOINTS.iter().enumerate() {
-            for (side, letter) in [("Left", 'L'), ("Right", 'R')] {
-                let found = start(&rig.bones, &format!("{side}{ours}"));
-                let found = Vec3::from(alignment.apply(found.to_array()));
-                let error = 1e3 * found.distance(place(&true_bones, &format!("{theirs}.{letter}")));
-                errors[row].push(error);
-                apart[row] += 0.5 * error;
+        let truly = on_surface(&true_mesh, &mut stream(&identity))?;
+        let own = Rig::new(&truly, &fuse(&truly, Options::default(), &|_| {})?.mesh)?;
+        let mut apart = [[0.0; 6]; 2];
+        for (kind, rig) in [&rig, &own].into_iter().enumerate() {
+            for (row, (ours, theirs)) in JOINTS.iter().enumerate() {
+                for (side, letter) in [("Left", 'L'), ("Right", 'R')] {
+                    let found = start(&rig.bones, &format!("{side}{ours}"));
+                    let found = if kind == 0 { Vec3::from(alignment.apply(found.to_array())) } else { found };
+                    let error = 1e3 * found.distance(place(&true_bones, &format!("{theirs}.{letter}")));
+                    errors[kind][row].push(error);
+                    apart[kind][row] += 0.5 * error;
+                }
             }
         }
         for names in [["Arm", "ForeArm"], ["ForeArm", "Hand"], ["UpLeg", "Leg"], ["Leg", "Foot"]] {
@@ -84,22 +93,60 @@ fn main() -> Result<(), Box<dyn Error>> {
         surfaces[0].push(before);
         surfaces[1].push(after);
         let unsure: Vec<&str> = rig.bones.iter().filter(|bone| !bone.is_sure).map(Bone::short).collect();
-        let apart = apart.map(|error| format!("{error:.0}")).join(" ");
+        let [apart, own] = apart.map(|errors| errors.map(|error| format!("{error:.0}")).join(" "));
         println!(
-            "{index:04}: {apart} mm, surface {before:.1} mm, posed {after:.1} mm, {seconds:.2} s {unsure:?}"
+            "{index:04}: {apart} mm, on the true surface {own} mm, surface {before:.1} mm, posed {after:.1} mm, {seconds:.2} s {unsure:?}"
         );
     }
-    println!("joint: mean and median error in mm");
-    let mut all = Vec::new();
-    for ((name, _), errors) in JOINTS.iter().zip(&mut errors) {
-        all.extend_from_slice(errors);
-        println!("{name}: {}", figures(errors));
+    println!("joint: mean and median error in mm; of Gaussians on the true surface");
+    let mut all = [Vec::new(), Vec::new()];
+    for (row, (name, _)) in JOINTS.iter().enumerate() {
+        let figures = [0, 1].map(|kind| {
+            all[kind].extend_from_slice(&errors[kind][row]);
+            figures(&mut errors[kind][row])
+        });
+        println!("{name}: {}", figures.join("; "));
     }
-    println!("all: {}", figures(&mut all));
+    println!("all: {}", all.map(|mut all| figures(&mut all)).join("; "));
     println!("left against right, percent: {}", figures(&mut uneven));
     let [mut before, mut after] = surfaces;
     println!("Chamfer distance, mm: {}; in another pose: {}", figures(&mut before), figures(&mut after));
     Ok(())
+}
+
+/// Gaussians everywhere on a surface, in its colours.
+fn on_surface(mesh: &Mesh, random: &mut impl Rng) -> Result<Loaded, Box<dyn Error>> {
+    let (mut means, mut colors) = (Vec::new(), Vec::new());
+    for face in &mesh.faces {
+        let [a, b, c] = face.positions.map(|row| mesh.positions[row as usize]);
+        let count = 0.5 * (b - a).cross(c - a).length() / (SPACING * SPACING);
+        let material = &mesh.materials[face.material as usize];
+        for _ in 0..(count + random.random::<f32>()) as usize {
+            let (u, v) = (random.random::<f32>(), random.random::<f32>());
+            let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
+            let mut color =
+                material.color * mesh.colors.get(face.positions[0] as usize).copied().unwrap_or(Vec3::ONE);
+            if let (Some(rows), Some(texture)) = (face.texcoords, &material.texture) {
+                let [a, b, c] = rows.map(|row| mesh.texcoords[row as usize]);
+                let at = (a + u * (b - a) + v * (c - a)).rem_euclid(glam::Vec2::ONE);
+                let (width, height) = texture.dimensions();
+                let pixel = [at.x * width as f32, (1.0 - at.y) * height as f32].map(|x| x as u32);
+                let texel = texture.get_pixel(pixel[0].min(width - 1), pixel[1].min(height - 1));
+                color *= Vec3::from(texel.0.map(|byte| f32::from(byte) / 255.0));
+            }
+            means.extend((a + u * (b - a) + v * (c - a)).to_array());
+            colors.extend(color.to_array());
+        }
+    }
+    let n = means.len() / 3;
+    let device = Device::flex();
+    let rows =
+        |values: Vec<f32>, width: usize| Tensor::<2>::from_data(TensorData::new(values, [n, width]), &device);
+    let turns = rows([1.0, 0.0, 0.0, 0.0].repeat(n), 4);
+    let scales = rows(vec![0.7 * SPACING; 3 * n], 3);
+    let gaussians =
+        Gaussians::new(rows(means, 3), turns, scales, Tensor::full([n], 0.99, &device), rows(colors, 3))?;
+    Ok(Stored::of(&gaussians)?.load(&device))
 }
 
 /// The similarity from one surface to another, and their distance in mm.
