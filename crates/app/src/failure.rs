@@ -9,6 +9,7 @@ use snapsnap_base::config::ConfigError;
 use snapsnap_eval::EvalError;
 use snapsnap_mesh::fuse::FuseError;
 use snapsnap_net::weights::WeightsError;
+use snapsnap_photo::NoPerson;
 use snapsnap_rig::RigError;
 use snapsnap_splat::SplatError;
 use snapsnap_train::TrainError;
@@ -69,75 +70,46 @@ impl fmt::Display for Failure {
     }
 }
 
-macro_rules! input_error {
-    ($($error:ty),+) => {
+/// Turns errors into failures with the same message: as their patterns say, else into [`Failure::Input`].
+macro_rules! from_errors {
+    ($($error:ident { $($pattern:pat => $failure:expr,)* })+) => {
         $(impl From<$error> for Failure {
             fn from(e: $error) -> Self {
-                Self::Input(e.to_string())
+                match e {
+                    $($pattern => $failure,)*
+                    e => Self::Input(e.to_string()),
+                }
             }
         })+
     };
 }
 
-input_error!(ConfigError, WeightsError);
-
-impl From<FileError> for Failure {
-    fn from(e: FileError) -> Self {
-        if matches!(e, FileError::Write { .. }) {
-            Self::Write(e.to_string())
-        } else {
-            Self::Input(e.to_string())
-        }
+from_errors! {
+    ConfigError {}
+    WeightsError {}
+    NoPerson {}
+    FileError {
+        e @ FileError::Write { .. } => Self::Write(e.to_string()),
     }
-}
-
-impl From<SplatError> for Failure {
-    fn from(e: SplatError) -> Self {
-        match e {
-            SplatError::File(e) => e.into(),
-            SplatError::Shape { .. } | SplatError::NotFinite { .. } => Self::Internal(e.to_string()),
-            _ => Self::Input(e.to_string()),
-        }
+    SplatError {
+        SplatError::File(e) => e.into(),
+        e @ (SplatError::Shape { .. } | SplatError::NotFinite { .. }) => Self::Internal(e.to_string()),
     }
-}
-
-impl From<FuseError> for Failure {
-    fn from(e: FuseError) -> Self {
-        match e {
-            FuseError::Splat(e) => e.into(),
-            FuseError::Reduce(_) => Self::Internal(e.to_string()),
-            FuseError::Long(_) => Self::Input(format!("{e}; add --force to make it anyway")),
-            _ => Self::Input(e.to_string()),
-        }
+    FuseError {
+        FuseError::Splat(e) => e.into(),
+        e @ FuseError::Reduce(_) => Self::Internal(e.to_string()),
+        e @ FuseError::Long(_) => Self::Input(format!("{e}; add --force to make it anyway")),
     }
-}
-
-impl From<RigError> for Failure {
-    fn from(e: RigError) -> Self {
-        match e {
-            RigError::Fuse(e) => e.into(),
-            RigError::Splat(e) => e.into(),
-            _ => Self::Input(e.to_string()),
-        }
+    RigError {
+        RigError::Fuse(e) => e.into(),
+        RigError::Splat(e) => e.into(),
     }
-}
-
-impl From<EvalError> for Failure {
-    fn from(e: EvalError) -> Self {
-        match e {
-            EvalError::Splat(e) => e.into(),
-            _ => Self::Input(e.to_string()),
-        }
+    EvalError {
+        EvalError::Splat(e) => e.into(),
     }
-}
-
-impl From<TrainError> for Failure {
-    fn from(e: TrainError) -> Self {
-        match e {
-            TrainError::Splat(e) => e.into(),
-            TrainError::File(e) | TrainError::Weights(WeightsError::File(e)) => e.into(),
-            TrainError::Stuck { .. } => Self::Internal(e.to_string()),
-            _ => Self::Input(e.to_string()),
-        }
+    TrainError {
+        TrainError::Splat(e) => e.into(),
+        TrainError::File(e) | TrainError::Weights(WeightsError::File(e)) => e.into(),
+        e @ TrainError::Stuck { .. } => Self::Internal(e.to_string()),
     }
 }

@@ -105,8 +105,7 @@ pub fn reconstruct<'py>(
             return Err(Failure::Input(doubts.join("; ")));
         }
         check();
-        let person = snapsnap_photo::person(&read, &networks, &told, &|_| check());
-        let person = person.map_err(|none| Failure::Input(none.to_string()))?;
+        let person = snapsnap_photo::person(&read, &networks, &told, &|_| check())?;
         let made = &person.made;
         let time = |(name, time): &(&str, std::time::Duration)| (name.to_string(), json!(time.as_secs_f64()));
         let report = json!({

@@ -83,7 +83,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let precision = Precision::of_weights(&config, &device);
     let networks = Reconstructor::load(&weights, &device)?.in_precision(precision);
     let made = snapsnap_photo::person(&read, &networks, &told, &|name| progress.stage(name));
-    let world = made.map_err(|none| Failure::Input(none.to_string()))?.gaussians;
+    let world = made?.gaussians;
     let seconds = since.elapsed().as_secs_f64();
     progress.stage("writing");
     scene::write(&world, &folder.file("human.ply"))?;

@@ -148,8 +148,7 @@ fn read_all(
 
 /// The person of two photographs.
 fn make(photographs: &Photographs, networks: &Reconstructor, told: &Told) -> Result<Stored, Failure> {
-    let person = snapsnap_photo::person(photographs, networks, told, &|_| ());
-    Ok(Stored::of(&person.map_err(|none| Failure::Input(none.to_string()))?.gaussians)?)
+    Ok(Stored::of(&snapsnap_photo::person(photographs, networks, told, &|_| ())?.gaussians)?)
 }
 
 /// Writes all people.

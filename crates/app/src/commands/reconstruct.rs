@@ -195,7 +195,7 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
             let steps: String = steps.iter().map(|step| format!("\n  {step}")).collect();
             Failure::file(weights.path(), format!("{none}, so nothing was written; the steps:{steps}"))
         }
-        NoPerson::Camera { .. } => Failure::Input(none.to_string()),
+        NoPerson::Camera { .. } => none.into(),
     })?;
     times.append(&mut made.times);
 

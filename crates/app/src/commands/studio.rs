@@ -171,8 +171,7 @@ impl Studio {
         let mut read =
             snapsnap_photo::read(&[source(0), source(1)], Cutting::Missing, side, placement, told.focal)?;
         read.cutouts = Vec::new();
-        let person = person(&read, &networks, told, &|step| job.step(step))
-            .map_err(|none| text(StatusCode::UNPROCESSABLE_ENTITY, &none.to_string()))?;
+        let person = person(&read, &networks, told, &|step| job.step(step)).map_err(Failure::from)?;
         let doubt = |doubt: &Doubt| {
             let mut said = said(doubt.to_string(), &doubt.sign);
             said["of"] = json!(doubt.photographs);
