@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::sync_channel;
 use std::thread;
 
 use serde::{Deserialize, Serialize};
@@ -85,13 +85,22 @@ pub fn run(arguments: &Arguments, pairs: &Path) -> Result<(), Failure> {
     output::write(&path, toml::to_string_pretty(&settings).expect("TOML types").as_bytes())?;
     let progress = Progress::counted("people");
     let (to_networks, photographs) = sync_channel(1);
-    let (to_writer, people) = sync_channel(1);
+    let (to_writer, people) = sync_channel::<(String, Result<Stored, Failure>)>(1);
+    // It has room for all results, and closes early only after an output that could not be written.
     let (to_list, ended) = sync_channel(jobs.len());
     let (jobs, of_person) = (&jobs, &of_person);
     thread::scope(|scope| {
         let config = &config;
-        scope.spawn(move || read_all(arguments, jobs, config, &told, &to_networks));
-        scope.spawn(move || write_all(arguments, of_person, people, &to_list));
+        scope.spawn(move || {
+            let read = |job: &Job| unpanicked(|| read_one(arguments, job, config, &told));
+            jobs.iter().try_for_each(|job| to_networks.send(read(job)))
+        });
+        scope.spawn(move || {
+            people.into_iter().try_for_each(|(name, person)| {
+                let write = |stored: Stored| unpanicked(|| arguments.axes.write(&stored, &of_person(&name)));
+                to_list.send((name.clone(), person.and_then(write)))
+            })
+        });
         let mut results = 0;
         let mut count = |(name, result): (String, Result<(), Failure>)| {
             results += 1;
@@ -123,49 +132,19 @@ fn check_settings(path: &Path, settings: &Settings) -> Result<(), Failure> {
     output::check_settings(path, &there, &wanted)
 }
 
-/// Reads all photographs, one person after another, until the receiver is gone.
-fn read_all(
-    arguments: &Arguments,
-    jobs: &[Job],
-    config: &Config,
-    told: &Told,
-    to_networks: &SyncSender<Result<Photographs, Failure>>,
-) {
-    for job in jobs {
-        let read = unpanicked(|| {
-            let paths = job.photographs.as_ref().map_err(|missing| Failure::Input(missing.clone()))?;
-            paths.iter().try_for_each(|path| check_memory(path, picture::size(path, None)?))?;
-            let sources = [0, 1].map(|i| Source { mask: job.masks[i].as_deref(), ..Source::file(&paths[i]) });
-            let mut read = arguments.read(&sources, config, told, &format!("{}: ", job.name))?;
-            read.cutouts = Vec::new();
-            Ok(read)
-        });
-        if to_networks.send(read).is_err() {
-            return;
-        }
-    }
+/// Reads the photographs of one person.
+fn read_one(arguments: &Arguments, job: &Job, config: &Config, told: &Told) -> Result<Photographs, Failure> {
+    let paths = job.photographs.as_ref().map_err(|missing| Failure::Input(missing.clone()))?;
+    paths.iter().try_for_each(|path| check_memory(path, picture::size(path, None)?))?;
+    let sources = [0, 1].map(|i| Source { mask: job.masks[i].as_deref(), ..Source::file(&paths[i]) });
+    let mut read = arguments.read(&sources, config, told, &format!("{}: ", job.name))?;
+    read.cutouts = Vec::new();
+    Ok(read)
 }
 
 /// The person of two photographs.
 fn make(photographs: &Photographs, networks: &Reconstructor, told: &Told) -> Result<Stored, Failure> {
     Ok(Stored::of(&snapsnap_photo::person(photographs, networks, told, &|_| ())?.gaussians)?)
-}
-
-/// Writes all people.
-fn write_all(
-    arguments: &Arguments,
-    of_person: &impl Fn(&str) -> PathBuf,
-    people: Receiver<(String, Result<Stored, Failure>)>,
-    to_list: &SyncSender<(String, Result<(), Failure>)>,
-) {
-    for (name, person) in people {
-        let written =
-            person.and_then(|stored| unpanicked(|| arguments.axes.write(&stored, &of_person(&name))));
-        // The channel has room for all results. It closes early only after an output that could not be written.
-        if to_list.send((name, written)).is_err() {
-            return;
-        }
-    }
 }
 
 /// A row of a table. Each column may be missing, and each value empty.
