@@ -80,10 +80,7 @@ pub fn choose_in_turn(name: &str, turn: usize) -> Result<Device, Failure> {
 
 /// Both CPU backends, and of every compiled kind the first card, or else a software adapter that can run kernels.
 pub fn all() -> Vec<Device> {
-    let gpus = gpus().into_iter().filter_map(|(name, ..)| choose(name).ok());
-    #[cfg(feature = "gpu")]
-    let gpus = [ndarray()].into_iter().chain(gpus);
-    [Device::flex()].into_iter().chain(gpus).collect()
+    compiled_in().into_iter().filter_map(|name| choose(name).ok()).collect()
 }
 
 /// A working device.
@@ -145,7 +142,7 @@ pub fn probe() -> String {
             // The graphics layer has no function for the memory of cards.
             memory: (!is_card(&device)).then(memory::there),
         };
-        devices(device_type).into_iter().enumerate().map(adapter).collect::<Vec<_>>()
+        devices(kind, device_type).into_iter().enumerate().map(adapter).collect::<Vec<_>>()
     };
     let drivers: Drivers = (gpus().into_iter().flat_map(of_kind).collect(), graphics_has_only_opengl());
     serde_json::to_string(&drivers).expect("plain text and numbers")
@@ -244,16 +241,12 @@ fn ndarray() -> Device {
 }
 
 /// The devices of a kind. Without a driver the graphics layer panics, and there are none.
-fn devices(kind: DeviceType) -> Vec<Device> {
-    #[cfg(feature = "gpu")]
-    let is_wgpu = matches!(kind, DeviceType::Wgpu);
-    #[cfg(not(feature = "gpu"))]
-    let is_wgpu = false;
+fn devices(kind: &str, device_type: DeviceType) -> Vec<Device> {
     let hook = panic::take_hook();
     panic::set_hook(Box::new(|_| {}));
-    let found = panic::catch_unwind(|| match is_wgpu && graphics_has_only_opengl() {
+    let found = panic::catch_unwind(|| match kind == "wgpu" && graphics_has_only_opengl() {
         true => Vec::new(),
-        false => Device::enumerate(kind).into_vec(),
+        false => Device::enumerate(device_type).into_vec(),
     });
     panic::set_hook(hook);
     found.unwrap_or_default()
@@ -262,7 +255,7 @@ fn devices(kind: DeviceType) -> Vec<Device> {
 fn nth(name: &str, kind: DeviceType, index: Option<usize>) -> Result<Device, Failure> {
     let kind_name = name.split(':').next().unwrap_or(name);
     let is_there = adapters().iter().any(|adapter| adapter.kind() == kind_name);
-    let devices = if is_there { devices(kind) } else { Vec::new() };
+    let devices = if is_there { devices(kind_name, kind) } else { Vec::new() };
     let found = devices.len();
     if found == 0 {
         let message =

@@ -42,25 +42,28 @@ pub fn there() -> u64 {
 
 /// Current memory of this process in bytes, on Linux.
 pub fn used() -> Option<u64> {
-    status("VmRSS")
+    status("VmRSS:")
 }
 
 /// Largest memory of this process so far in bytes, on Linux.
 pub fn most_used() -> Option<u64> {
-    status("VmHWM")
+    status("VmHWM:")
 }
 
 fn status(key: &str) -> Option<u64> {
-    let status = fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(':'))?;
-    Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
+    Some(number("/proc/self/status", key)? * 1024)
 }
 
 /// The limit that `ulimit -v` sets, in bytes, without addresses that this process has reserved and does not use.
 fn address_space() -> Option<u64> {
-    let limits = fs::read_to_string("/proc/self/limits").ok()?;
-    let line = limits.lines().find_map(|line| line.strip_prefix("Max address space"))?;
-    let limit: u64 = line.split_whitespace().next()?.parse().ok()?;
-    let reserved = status("VmSize")?.saturating_sub(used()?);
+    let limit = number("/proc/self/limits", "Max address space")?;
+    let reserved = status("VmSize:")?.saturating_sub(used()?);
     Some(limit.saturating_sub(reserved))
+}
+
+/// The number behind `key` in a file of lines.
+fn number(file: &str, key: &str) -> Option<u64> {
+    let text = fs::read_to_string(file).ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix(key))?;
+    line.split_whitespace().next()?.parse().ok()
 }
