@@ -10,18 +10,16 @@ use serde_json::json;
 use snapsnap_eval::pictures::Picture;
 use snapsnap_eval::region::{Region, margin};
 use snapsnap_eval::similarity::psnr;
-use snapsnap_net::Reconstructor;
-use snapsnap_net::precision::Precision;
 use snapsnap_photo::{Cutting, Source, Told};
 use snapsnap_splat::{Camera, Gaussians, RenderOptions, render, scene};
 
-use crate::arguments::ConfigArguments;
 use crate::failure::Failure;
+use crate::model::ModelArguments;
 use crate::pictures::{read_back, sheet, write_png};
 use crate::progress::Progress;
 use crate::report::{REPORT, ReportFolder, header};
 use crate::turntable::Turntable;
-use crate::{device, output, say, weights};
+use crate::{device, output, say};
 
 const FILES: &[&str] = &[
     "front.png",
@@ -71,17 +69,17 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     for (name, bytes) in PHOTOGRAPHS {
         output::write(&folder.file(name), bytes)?;
     }
-    let weights = weights::open(None, &ConfigArguments::default())?;
-    let config = weights.config.clone();
+    let model = ModelArguments::new(None, &arguments.device);
+    let weights = model.open()?;
+    let config = &weights.config;
     let since = Instant::now();
     // The sample pair fills its canvas. Hence its cameras are known, and other views can be compared.
     let photographs = PHOTOGRAPHS.map(|(name, _)| folder.path.join(name));
     let sources = photographs.each_ref().map(|path| Source::file(path));
     let told = Told { as_is: true, ..Told::default() };
     let side = config.network.resolution;
-    let read = snapsnap_photo::read(&sources, Cutting::Given, side, told.placement(&config), None)?;
-    let precision = Precision::of_weights(&config, &device);
-    let networks = Reconstructor::load(&weights, &device)?.in_precision(precision);
+    let read = snapsnap_photo::read(&sources, Cutting::Given, side, told.placement(config), None)?;
+    let (networks, _) = model.load(&weights, &device)?;
     let made = snapsnap_photo::person(&read, &networks, &told, &|name| progress.stage(name));
     let world = made?.gaussians;
     let seconds = since.elapsed().as_secs_f64();
