@@ -105,11 +105,8 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
     if arguments.raw.is_some() {
         check_raw(&views)?;
     }
-    let folder = match (&arguments.output, &arguments.raw) {
-        (None, Some(_)) => None,
-        (None, None) => Some(Path::new(DEFAULT_FOLDER)),
-        (Some(path), _) => Some(path.as_path()),
-    };
+    let default = arguments.raw.is_none().then_some(Path::new(DEFAULT_FOLDER));
+    let folder = arguments.output.as_deref().or(default);
     let folder =
         folder.map(|path| ViewFolder::new(path, views.len(), arguments.cameras.as_deref())).transpose()?;
     check_paths(arguments, folder.as_ref())?;
@@ -336,11 +333,12 @@ fn size(text: &str) -> Result<[u32; 2], String> {
 }
 
 fn color(text: &str) -> Result<[f32; 3], String> {
-    if let Some((_, level)) =
-        [("black", 0.0), ("grey", 0.5), ("white", 1.0)].iter().find(|(name, _)| *name == text)
-    {
-        return Ok([*level; 3]);
-    }
+    let text = match text {
+        "black" => "0,0,0",
+        "grey" => "0.5,0.5,0.5",
+        "white" => "1,1,1",
+        numbers => numbers,
+    };
     let channel = |text: &str| text.trim().parse::<f32>().ok().filter(|c| (0.0..=1.0).contains(c));
     let channels: Option<Vec<f32>> = text.split(',').map(channel).collect();
     channels
