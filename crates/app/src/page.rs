@@ -95,16 +95,11 @@ pub fn show(
             let guests = guests.as_ref().filter(|_| request.is_near);
             match guests.filter(|_| request.path == "/invitation" && is_read(request)) {
                 Some(guests) => Some(guests.invitation()),
-                None => file(&class(command, guests.is_some()), request),
+                None => file(&format!("{command}{}", guests.map_or("", |_| " inviting")), request),
             }
         });
         answer.unwrap_or_else(|| rest(request, body).unwrap_or_else(|refused| refused))
     })
-}
-
-/// Classes of the page for a command, on a machine whose page invites other devices.
-fn class(command: &str, is_inviting: bool) -> String {
-    format!("{command}{}", if is_inviting { " inviting" } else { "" })
 }
 
 /// Refuses requests of anybody but this server's own page, on this machine or on a device that has joined, and lets
@@ -142,13 +137,13 @@ fn refused(request: &Request, port: u16, guests: Option<&Guests>) -> Option<Answ
         .then(|| text(StatusCode::FORBIDDEN, "only for this server's own page"))
 }
 
-/// A file of the page.
-fn file(command: &str, request: &Request) -> Option<Answer> {
+/// A file of the page, whose HTML has these classes.
+fn file(classes: &str, request: &Request) -> Option<Answer> {
     if !is_read(request) {
         return None;
     }
     if request.path == "/" {
-        let index = INDEX.replace(VIEW, &VIEW.replace("view", command));
+        let index = INDEX.replace(VIEW, &VIEW.replace("view", classes));
         return Some(answer("text/html; charset=utf-8", Arc::new(index)));
     }
     let (_, kind, content) = FILES.iter().find(|(name, ..)| *name == request.path)?;
