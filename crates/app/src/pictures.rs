@@ -32,8 +32,7 @@ pub fn read_back<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, Failure>
 
 /// Writes a PNG, whole or not at all.
 pub fn write_png(path: &Path, picture: &RgbImage) -> Result<(), Failure> {
-    preview::write_png(path, picture)?;
-    Ok(())
+    Ok(preview::write_png(path, picture).map(drop)?)
 }
 
 /// The file of an endless animation.

@@ -77,11 +77,8 @@ impl ReportFolder {
         let text = serde_json::to_string_pretty(value).expect("a value") + "\n";
         self.text(REPORT, &text)?;
         let written = self.written.borrow();
-        for name in self.files.iter().filter(|name| !written.iter().any(|file| file == *name)) {
-            let path = self.path.join(name);
-            output::remove(&path)?;
-        }
-        Ok(())
+        let mut older = self.files.iter().filter(|name| !written.iter().any(|file| file == *name));
+        older.try_for_each(|name| output::remove(&self.path.join(name)))
     }
 
     /// Path of a file that the caller writes.
