@@ -12,7 +12,7 @@ use glam::Vec2;
 use http::StatusCode;
 use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
-use image::{GrayImage, ImageFormat};
+use image::{DynamicImage, GrayImage, ImageFormat};
 use serde_json::{Value, json};
 use snapsnap_mesh::picture;
 use snapsnap_net::Reconstructor;
@@ -98,11 +98,8 @@ impl Studio {
     fn networks(&self, job: &Job, body: &Body) -> Result<MutexGuard<'_, Reconstructor>, Answer> {
         job.step("waiting for another page");
         let networks = self.networks.lock().unwrap_or_else(PoisonError::into_inner);
-        if body.is_awaited() {
-            Ok(networks)
-        } else {
-            Err(text(StatusCode::REQUEST_TIMEOUT, "the page was closed"))
-        }
+        let closed = || text(StatusCode::REQUEST_TIMEOUT, "the page was closed");
+        body.is_awaited().then_some(networks).ok_or_else(closed)
     }
 
     /// A photograph → its picture, as JPEG, and the person's mask, as PNG, both reduced to [`PREVIEW`]; as JSON the
@@ -153,13 +150,11 @@ impl Studio {
         }
         let networks = self.networks(&job, body)?;
         // Decoded strokes are larger than an upload: only one job at a time has them.
-        let front_strokes = strokes("front strokes", front_strokes)?;
-        let back_strokes = strokes("back strokes", back_strokes)?;
-        let all = [front_strokes.as_ref(), back_strokes.as_ref()];
-        let source = |i: usize| {
+        let strokes = [strokes("front strokes", front_strokes)?, strokes("back strokes", back_strokes)?];
+        let sources = [0, 1].map(|i| {
             let content = Content::Bytes(photographs[i]);
-            Source { content, strokes: all[i], ..Source::file(names[i]) }
-        };
+            Source { content, strokes: strokes[i].as_ref(), ..Source::file(names[i]) }
+        });
         job.step("photographs");
         let config = networks.config();
         let told = self.camera.updated(request.header("x-told").unwrap_or("{}"));
@@ -168,8 +163,7 @@ impl Studio {
             |e: Failure| text(StatusCode::UNPROCESSABLE_ENTITY, e.to_string().trim_start_matches('-'));
         let told = &told.and_then(|camera| camera.told(config, false)).map_err(wrong)?;
         let (side, placement) = (config.network.resolution, told.placement(config));
-        let mut read =
-            snapsnap_photo::read(&[source(0), source(1)], Cutting::Missing, side, placement, told.focal)?;
+        let mut read = snapsnap_photo::read(&sources, Cutting::Missing, side, placement, told.focal)?;
         read.cutouts = Vec::new();
         let person = person(&read, &networks, told, &|step| job.step(step)).map_err(Failure::from)?;
         let doubt = |doubt: &Doubt| {
@@ -244,8 +238,6 @@ fn parts<'a, const N: usize>(request: &Request, body: &'a [u8]) -> Result<[&'a [
 
 /// Strokes of the page's brush; `None` if there are none.
 fn strokes(name: &str, bytes: &[u8]) -> Result<Option<GrayImage>, Failure> {
-    if bytes.is_empty() {
-        return Ok(None);
-    }
-    Ok(Some(picture::decode_bytes(Path::new(name), bytes, STROKES)?.into_luma8()))
+    let decode = || picture::decode_bytes(Path::new(name), bytes, STROKES);
+    Ok((!bytes.is_empty()).then(decode).transpose()?.map(DynamicImage::into_luma8))
 }
