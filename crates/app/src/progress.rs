@@ -19,8 +19,8 @@ pub fn shown(bar: ProgressBar, template: &str) -> Option<ProgressBar> {
 
 /// Progress of one command.
 pub struct Progress {
+    /// It is cleared when it is dropped.
     bar: Option<ProgressBar>,
-    plain: bool,
     /// Steps reported by the last plain line.
     reported: Cell<u64>,
     start: Instant,
@@ -59,16 +59,14 @@ impl Progress {
     fn new(bar: ProgressBar, template: &str) -> Self {
         let bar = shown(bar, template);
         bar.iter().for_each(|bar| bar.enable_steady_tick(Duration::from_millis(100)));
-        let plain = bar.is_none() && !say::is_quiet();
-        Self { bar, plain, reported: Cell::new(0), start: Instant::now() }
+        Self { bar, reported: Cell::new(0), start: Instant::now() }
     }
 
     /// Reports the start of a module.
     pub fn stage(&self, name: &str) {
-        if let Some(bar) = &self.bar {
-            bar.set_message(name.to_owned());
-        } else if self.plain {
-            say::err(&format!("{name} …"));
+        match &self.bar {
+            Some(bar) => bar.set_message(name.to_owned()),
+            None => say::note(&format!("{name} …")),
         }
     }
 
@@ -78,22 +76,13 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.set_length(total);
             bar.set_position(done);
-        } else if self.plain
-            && done > self.reported.get()
+        } else if done > self.reported.get()
             && (done == total || done >= self.reported.get() + total.div_ceil(LINES))
         {
             self.reported.set(done);
             let rate = done as f64 / self.start.elapsed().as_secs_f64();
             let left = (total - done) as f64 / rate;
-            say::err(&format!("{done} of {total} {unit}, {rate:.1} a second, {left:.0} s left"));
-        }
-    }
-}
-
-impl Drop for Progress {
-    fn drop(&mut self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
+            say::note(&format!("{done} of {total} {unit}, {rate:.1} a second, {left:.0} s left"));
         }
     }
 }
