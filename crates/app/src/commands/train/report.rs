@@ -52,9 +52,6 @@ impl Reporter {
 
 impl Watch for Reporter {
     fn step(&mut self, line: &Line, steps: u64, skipped: u64) {
-        if say::is_quiet() {
-            return;
-        }
         let value = |name: &str| line.values.get(name).copied().unwrap_or_default();
         /// Values that are not parts of the loss.
         const OTHERS: [&str; 6] =
@@ -84,7 +81,7 @@ impl Watch for Reporter {
             bar.set_message(message);
         } else if line.step == first || self.printed.is_none_or(|printed| printed.elapsed() >= PAUSE) {
             self.printed = Some(Instant::now());
-            say::err(&format!("step {} of {steps}: {message}", line.step));
+            say::note(&format!("step {} of {steps}: {message}", line.step));
         }
     }
 
