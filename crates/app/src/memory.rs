@@ -20,13 +20,14 @@ pub fn check(what: &str, needed: u64, mend: &str) -> Result<(), Failure> {
     bail!("{what} needs {needed:.1} GB of memory, but this process can have only {there:.1} GB: {mend}")
 }
 
-/// Refuses networks that need more memory on the CPU than this process can have.
-pub fn check_networks(weights: &WeightFile, device: &Device) -> Result<(), Failure> {
-    if !is_cpu(device) {
-        return Ok(());
+/// The device. Refuses the CPU if the networks need more memory than this process can have.
+pub fn with_room(device: Device, weights: &WeightFile) -> Result<Device, Failure> {
+    if is_cpu(&device) {
+        let what = format!("a canvas of {0}×{0} pixels", weights.config.network.resolution);
+        let needed = weights.config.memory_needed(weights.parameters());
+        check(&what, needed, "choose a smaller `network.resolution`")?;
     }
-    let what = format!("a canvas of {0}×{0} pixels", weights.config.network.resolution);
-    check(&what, weights.config.memory_needed(weights.parameters()), "choose a smaller `network.resolution`")
+    Ok(device)
 }
 
 /// Memory of the machine in bytes, or the limit of this process if it is smaller.

@@ -57,20 +57,15 @@ impl ModelArguments {
 
     /// The device for many people, if the networks fit into its memory.
     pub fn device(&self, weights: &WeightFile) -> Result<Device, Failure> {
-        let device = device::choose(&self.device)?;
-        memory::check_networks(weights, &device)?;
-        Ok(device)
+        memory::with_room(device::choose(&self.device)?, weights)
     }
 
     /// The device for one person, if the networks fit into its memory.
     pub fn device_for_one(&self, weights: &WeightFile) -> Result<Device, Failure> {
         /// Parameters of networks that a CPU needs long for.
         const MANY: u64 = 100_000_000;
-        let is_small = weights.parameters() < MANY;
-        let device =
-            if is_small { device::choose_for_one(&self.device) } else { device::choose(&self.device) }?;
-        memory::check_networks(weights, &device)?;
-        Ok(device)
+        let choose = if weights.parameters() < MANY { device::choose_for_one } else { device::choose };
+        memory::with_room(choose(&self.device)?, weights)
     }
 
     /// Loads the networks.

@@ -219,7 +219,7 @@ pub(super) fn opened(variant: &Variant) -> Result<(WeightFile, Device), Failure>
     let device = device::choose(variant.device.as_deref().unwrap_or("auto"))?;
     let arguments = ConfigArguments { set: variant.set.clone(), ..ConfigArguments::default() };
     let weights = weights::open(variant.weights.as_deref(), &arguments)?;
-    memory::check_networks(&weights, &device)?;
+    let device = memory::with_room(device, &weights)?;
     Ok((weights, device))
 }
 
