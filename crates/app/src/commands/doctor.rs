@@ -73,18 +73,15 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
         say::json(&format!("{report:#}"))?;
         return broken(&weights);
     }
+    let mpi =
+        if cfg!(feature = "mpi") { "compiled in" } else { "not compiled in: build with --features mpi" };
+    let bf16 = if bf16::is_there() { "AVX-512" } else { "no instructions for it in this processor" };
     let mut lines = vec![
         format!("snapsnap {}, commit {}", env!("CARGO_PKG_VERSION"), env!("SNAPSNAP_COMMIT")),
         format!("compiled in  {}", device::compiled_in().join(", ")),
-        format!(
-            "MPI          {}",
-            if cfg!(feature = "mpi") { "compiled in" } else { "not compiled in: build with --features mpi" }
-        ),
+        format!("MPI          {mpi}"),
         format!("threads      {}", threads()),
-        format!(
-            "bf16         {}",
-            if bf16::is_there() { "AVX-512" } else { "no instructions for it in this processor" }
-        ),
+        format!("bf16         {bf16}"),
         format!("memory       {}", gigabytes(memory)),
         "devices".into(),
     ];
@@ -114,15 +111,12 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
 
 /// The failure of the first damaged weights. Missing parts are no failure.
 fn broken(weights: &[Weights]) -> Result<(), Failure> {
-    for Weights { name, state, .. } in weights {
-        if let Err(message) = state {
-            // Messages about files begin with the file's name already.
-            let is_named = message.starts_with(name);
-            let message = if is_named { message.clone() } else { format!("{name}: {message}") };
-            return Err(Failure::Input(message));
-        }
+    match weights.iter().find_map(|w| Some((&w.name, w.state.as_ref().err()?))) {
+        None => Ok(()),
+        // Messages about files begin with the file's name already.
+        Some((name, message)) if message.starts_with(name) => Err(Failure::Input(message.clone())),
+        Some((name, message)) => Err(Failure::Input(format!("{name}: {message}"))),
     }
-    Ok(())
 }
 
 /// The name of the device that `--device auto` takes, and the reason.
