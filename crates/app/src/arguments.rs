@@ -46,10 +46,7 @@ pub fn one_of<T: Copy + Send + Sync + 'static, const N: usize>(
 
 /// Refuses paths that are not UTF-8: the config beside an output contains them.
 pub fn check_utf8<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), Failure> {
-    match paths.into_iter().find(|path| path.to_str().is_none()) {
-        Some(path) => {
-            Err(Failure::file(path, "the path is not UTF-8, which the config beside an output must be"))
-        }
-        None => Ok(()),
-    }
+    let message = "the path is not UTF-8, which the config beside an output must be";
+    let other = paths.into_iter().find(|path| path.to_str().is_none());
+    other.map_or(Ok(()), |path| Err(Failure::file(path, message)))
 }

@@ -87,10 +87,8 @@ impl Batch {
             let mut start = [0; HEADER.len()];
             let read = file::open(&path).and_then(|mut there| there.read_exact(&mut start));
             if read.is_err() || start != *HEADER.as_bytes() {
-                return Err(Failure::file(
-                    &path,
-                    "would be replaced by the list of failures, but is another file: move it away",
-                ));
+                let message = "would be replaced by the list of failures, but is another file: move it away";
+                return Err(Failure::file(&path, message));
             }
             remove(&path)?;
         }
@@ -111,11 +109,8 @@ impl Batch {
             .map(|(_, job)| job)
             .partition(|job| output(job).metadata().is_ok_and(|there| there.len() > 0));
         if !there.is_empty() {
-            say::note(&format!(
-                "{} of {} outputs exist already and are kept",
-                there.len(),
-                there.len() + missing.len()
-            ));
+            let (kept, all) = (there.len(), there.len() + missing.len());
+            say::note(&format!("{kept} of {all} outputs exist already and are kept"));
         }
         missing
     }
@@ -132,8 +127,7 @@ impl Batch {
         let path = self.path();
         let wrong = |e: csv::Error| Failure::cannot_write(&path, &e.into());
         if self.list.is_none() {
-            let mut list =
-                csv::Writer::from_writer(File::create(&path).map_err(|e| Failure::cannot_write(&path, &e))?);
+            let mut list = csv::Writer::from_path(&path).map_err(wrong)?;
             list.write_record(HEADER.split(',')).map_err(wrong)?;
             self.list = Some(list);
         }

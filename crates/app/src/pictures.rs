@@ -19,8 +19,7 @@ const GIF_SPEED: i32 = 10;
 pub fn picture(color: &Tensor<4>) -> Result<RgbImage, Failure> {
     let [_, height, width, _] = color.dims();
     let values = read_back(color.clone().narrow(0, 0, 1))?;
-    let bytes = values.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    Ok(RgbImage::from_raw(width as u32, height as u32, bytes).expect("three bytes per pixel"))
+    Ok(preview::picture([width, height], |i| [0, 1, 2].map(|c| values[3 * i + c])))
 }
 
 /// Values of a render, copied to the host.

@@ -181,13 +181,9 @@ impl Target {
 
     /// Refuses companions of a new mesh that are there already.
     pub fn check_companions(&self) -> Result<(), Failure> {
-        match self.companions.iter().find(|other| !self.path.exists() && other.exists()) {
-            None => Ok(()),
-            Some(other) => Err(Failure::file(
-                other,
-                "would be replaced, but belongs to no mesh of this name: move it away",
-            )),
-        }
+        let message = "would be replaced, but belongs to no mesh of this name: move it away";
+        let other = self.companions.iter().find(|other| !self.path.exists() && other.exists());
+        other.map_or(Ok(()), |other| Err(Failure::file(other, message)))
     }
 
     /// Makes the mesh of Gaussians.
