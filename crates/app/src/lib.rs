@@ -39,9 +39,6 @@ pub use commands::convert::drawable;
 pub use failure::Failure;
 pub use model::{CameraArguments, ModelArguments, check_memory};
 
-/// The program's version, with commit and date where the sources were in a repository.
-const VERSION: &str = env!("SNAPSNAP_VERSION");
-
 /// Every operation allocates and frees large tensors. mimalloc keeps their pages, while the system allocator returns
 /// them to the kernel and causes page faults.
 #[global_allocator]
@@ -83,7 +80,7 @@ const FIRST_STEPS: &str = "First steps:
 #[derive(Parser)]
 #[command(
     name = "snapsnap",
-    version = VERSION,
+    version = env!("SNAPSNAP_VERSION"),
     about = "Two photographs of a person become a 3D Gaussian human.",
     after_help = FIRST_STEPS
 )]
