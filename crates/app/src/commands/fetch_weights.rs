@@ -103,17 +103,13 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     make_folder(&arguments.output)?;
     for (item, origin) in &wanted {
         let path = arguments.output.join(item.file);
-        let outcome = if path.symlink_metadata().is_ok() {
-            check_existing(item, &path)?;
-            "is there"
-        } else {
-            if is_address(origin) {
-                download(item, origin, &path)?;
-            } else {
-                copy(item, Path::new(origin), &path)?;
-            }
-            "fetched"
-        };
+        let is_there = path.symlink_metadata().is_ok();
+        match is_address(origin) {
+            _ if is_there => check_existing(item, &path),
+            true => download(item, origin, &path),
+            false => copy(item, Path::new(origin), &path),
+        }?;
+        let outcome = if is_there { "is there" } else { "fetched" };
         say::out(&format!("{}: {outcome}, and sound", path.display()));
     }
     Ok(())
