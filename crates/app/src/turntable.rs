@@ -39,7 +39,7 @@ impl Turntable {
         let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
         match ending.as_deref() {
             ending if ending.is_none() || path.is_dir() => {
-                Ok(Self::Folder(ViewFolder::new(path, FRAMES, None)?))
+                ViewFolder::new(path, FRAMES, None).map(Self::Folder)
             }
             Some("gif") => Ok(Self::Gif(path.to_owned())),
             Some("png") => Ok(Self::Sheet(path.to_owned())),

@@ -86,19 +86,13 @@ fn one(input: &Path, output: &Path, axes: &AxesArguments) -> Result<(), Failure>
     if say::is_quiet() {
         return Ok(());
     }
-    let say = say::beside(output);
+    let (say, file) = (say::beside(output), output.display());
     for loss in stored.losses(kind) {
-        say(&format!("{}: {loss}", output.display()));
+        say(&format!("{file}: {loss}"));
     }
     let size = |path: &Path| std::fs::metadata(path).map_or(0.0, |metadata| metadata.len() as f64 / 1e6);
-    say(&format!(
-        "{}: {} Gaussians of SH degree {}, {:.1} MB instead of {:.1}",
-        output.display(),
-        stored.len(),
-        stored.degree(),
-        size(output),
-        size(input)
-    ));
+    let (count, degree, new, old) = (stored.len(), stored.degree(), size(output), size(input));
+    say(&format!("{file}: {count} Gaussians of SH degree {degree}, {new:.1} MB instead of {old:.1}"));
     Ok(())
 }
 

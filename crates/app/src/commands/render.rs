@@ -175,9 +175,8 @@ fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
         let [reading, rendering] = [reading, rendering].map(|time| time.as_secs_f64() * 1e3);
         say(&format!("reading {reading:.1} ms, rendering and writing {rendering:.1} ms"));
     }
-    let visible = counts.iter().filter(|c| c.visible > 0).count();
-    if visible < counts.len() {
-        let empty = counts.len() - visible;
+    let empty = counts.iter().filter(|c| c.visible == 0).count();
+    if empty > 0 {
         say::note(&format!("warning: {empty} of {} views show no Gaussian (see --verbose)", counts.len()));
     }
     if say::is_quiet() {

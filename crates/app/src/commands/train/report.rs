@@ -106,12 +106,10 @@ fn clock(seconds: f64) -> String {
 pub fn rehearsed(config: &TrainConfig, on: &Device, (step, validation): (Duration, Option<Duration>)) {
     let t = &config.training;
     let step = step.as_secs_f64();
-    let samples = t.batch as f64;
+    let (device, samples) = (device::describe(&on.clone().inner()), t.batch);
+    let rate = samples as f64 / step;
     say::out(&format!(
-        "device {}: a step of {samples} samples takes {:.3} s, {:.1} samples a second",
-        device::describe(&on.clone().inner()),
-        step,
-        samples / step
+        "device {device}: a step of {samples} samples takes {step:.3} s, {rate:.1} samples a second"
     ));
     let mut total = step * t.steps as f64;
     if let Some(validation) = validation {
