@@ -16,7 +16,7 @@ use snapsnap_splat::scene::Kind;
 
 use crate::arguments::one_of;
 use crate::failure::Failure;
-use crate::output::{is_same_folder, make_folder, remove};
+use crate::output::{make_folder, remove};
 use crate::progress::Progress;
 use crate::say;
 
@@ -175,7 +175,7 @@ pub fn each(
     output: impl Fn(&str) -> PathBuf,
     work: impl Fn(&Path, &str) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
-    if is_same_folder(folder, target) {
+    if matches!([folder, target].map(Path::canonicalize), [Ok(a), Ok(b)] if a == b) {
         return Err(Failure::file(target, "is the folder of the inputs: give another one"));
     }
     let scenes = scenes(folder)?;

@@ -35,10 +35,8 @@ const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' b
                       connect-src 'self' blob: data:; img-src 'self' blob: data:; style-src 'self'; base-uri 'none'; \
                       form-action 'none'; frame-ancestors 'none'";
 
-/// A file of the page: its path, type and content.
-type PageFile = (&'static str, &'static str, &'static [u8]);
-
-const FILES: [PageFile; 3] = [
+/// Files of the page: path, type and content.
+const FILES: [(&str, &str, &[u8]); 3] = [
     ("/viewer.js", "text/javascript; charset=utf-8", include_bytes!("../../../assets/viewer/viewer.js")),
     ("/viewer.css", "text/css; charset=utf-8", include_bytes!("../../../assets/viewer/viewer.css")),
     ("/LICENSES.md", "text/markdown; charset=utf-8", include_bytes!("../../../assets/viewer/LICENSES.md")),

@@ -24,19 +24,17 @@ struct Forward {
     rendered: Rendered,
 }
 
-/// Gradients of means, rotations, scales, opacities, colours and background.
-type Gradients<'py> = [Option<Bound<'py, PyByteArray>>; 6];
-
 #[pymethods]
 impl Tape {
-    /// Gradients of the sum of all outputs, each multiplied by its gradient.
+    /// Gradients of the sum of all outputs, each multiplied by its gradient: of means, rotations, scales, opacities,
+    /// colours and background.
     fn backward<'py>(
         &self,
         py: Python<'py>,
         color: PyBackedBytes,
         alpha: PyBackedBytes,
         depth: Option<PyBackedBytes>,
-    ) -> PyResult<Gradients<'py>> {
+    ) -> PyResult<[Option<Bound<'py, PyByteArray>>; 6]> {
         let forward = self.0.lock().unwrap_or_else(PoisonError::into_inner).take();
         let forward = forward.ok_or_else(|| PyRuntimeError::new_err("the gradients were taken already"))?;
         let gradients = run(py, move |_| {

@@ -117,11 +117,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Degrees and dB.
-type Errors = Vec<(f64, f64)>;
-
-/// The photographs, then each rendered view and its ground truth, and the views' PSNR on the person.
-fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Errors), Failure> {
+/// The photographs, then each rendered view and its ground truth, and the views' degrees and PSNR on the person, dB.
+fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Vec<(f64, f64)>), Failure> {
     let side = TRUTH as usize;
     let mut pictures = Vec::new();
     for (name, bytes) in PHOTOGRAPHS {

@@ -24,11 +24,9 @@ pub struct Arguments {
     page: PageArguments,
 }
 
-/// Length and time of a file, by which a replaced file is noticed.
-type Stamp = (u64, Option<SystemTime>);
-
-/// The served contents by extension, with the stamp of their file. All clients share them.
-type Made = Mutex<HashMap<&'static str, (Stamp, Content)>>;
+/// The served contents by extension. All clients share them. By length and time of its file each shows whether the file
+/// was replaced.
+type Made = Mutex<HashMap<&'static str, ((u64, Option<SystemTime>), Content)>>;
 
 /// The contents that are made at once, and those that take long.
 static MADE: [LazyLock<Made>; 2] = [LazyLock::new(Mutex::default), LazyLock::new(Mutex::default)];
