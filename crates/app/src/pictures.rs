@@ -1,7 +1,7 @@
 //! Rendered views and cut-out photographs as picture files.
 
 use std::io::Cursor;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use burn::tensor::Tensor;
 use image::buffer::ConvertBuffer;
@@ -10,7 +10,7 @@ use image::{Delay, Frame, GrayImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage
 use snapsnap_eval::preview;
 
 use crate::failure::Failure;
-use crate::output::{check_folder, make_folder, write};
+use crate::output::{make_folder, write};
 
 /// Speed of the search for a GIF's colours: 1 is best, 30 fastest.
 const GIF_SPEED: i32 = 10;
@@ -56,12 +56,6 @@ pub fn sheet(pictures: &[RgbImage], columns: u32) -> RgbImage {
         imageops::replace(&mut sheet, picture, x, y);
     }
     sheet
-}
-
-/// `--save-cutouts`: paths of front and back in the folder. Refuses a path that is no folder and cannot become one.
-pub fn cutout_paths(folder: &Path) -> Result<[PathBuf; 2], Failure> {
-    check_folder(folder)?;
-    Ok(["front.png", "back.png"].map(|name| folder.join(name)))
 }
 
 /// Writes a photograph with its mask as alpha channel, and makes the folder. Colours without coverage are black.

@@ -22,8 +22,8 @@ use super::pairs;
 use crate::batch::{KindArgument, ShardArgument, must_be_unused};
 use crate::failure::{Failure, bail};
 use crate::model::{CameraArguments, ModelArguments, check_memory};
-use crate::output::{check_kind, check_outputs, is_same_file};
-use crate::pictures::{cutout_paths, save_cutout};
+use crate::output::{check_folder, check_kind, check_outputs, is_same_file};
+use crate::pictures::save_cutout;
 use crate::progress::Progress;
 use crate::turntable::Turntable;
 use crate::{device, dump, memory, output, say};
@@ -164,7 +164,9 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
         bail!("--cutout network: --masks already tells the person from the background");
     }
     let told = arguments.camera.told(&config, arguments.as_is)?;
-    let saved = arguments.save_cutouts.as_deref().map(cutout_paths).transpose()?;
+    let cutout_folder = arguments.save_cutouts.as_ref();
+    cutout_folder.map_or(Ok(()), |folder| check_folder(folder))?;
+    let saved = cutout_folder.map(|folder| ["front.png", "back.png"].map(|name| folder.join(name)));
     let config_path =
         check_paths(arguments, paths, output, weights.path(), turntable.as_ref(), target.as_ref(), &saved)?;
     target.iter().try_for_each(Target::check_companions)?;
@@ -175,11 +177,9 @@ fn one(arguments: &Arguments, paths: [&PathBuf; 2]) -> Result<(), Failure> {
         [0, 1].map(|i| Source { mask: masks.get(i).map(PathBuf::as_path), ..Source::file(paths[i]) });
     let mut photographs = arguments.read(&sources, &config, &told, "")?;
     timed("photographs", since);
-    let cutouts = std::mem::take(&mut photographs.cutouts);
-    for (path, (rgb, mask)) in saved.iter().flatten().zip(&cutouts) {
-        save_cutout(path, rgb, mask)?;
+    for (path, (rgb, mask)) in saved.iter().flatten().zip(std::mem::take(&mut photographs.cutouts)) {
+        save_cutout(path, &rgb, &mask)?;
     }
-    drop(cutouts);
     let since = Instant::now();
     let device = arguments.model.device_for_one(&weights)?;
     timed("finding the device", since);
