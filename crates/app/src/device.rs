@@ -53,17 +53,11 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
 
 /// The device called `name` for one person and small networks: `auto` is the CPU. Each process compiles the kernels of
 /// a card anew, which takes longer than the CPU's whole work (docs/inference.md).
-///
-/// # Errors
-/// As [`choose`].
 pub fn choose_for_one(name: &str) -> Result<Device, Failure> {
     choose(if name == "auto" { "cpu" } else { name })
 }
 
 /// The device called `name` for process `turn` of several on this machine. Without an index they take the GPUs in turn.
-///
-/// # Errors
-/// As [`choose`].
 pub fn choose_in_turn(name: &str, turn: usize) -> Result<Device, Failure> {
     let device = choose(name)?;
     if memory::is_cpu(&device) || name.contains(':') {

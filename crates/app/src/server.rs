@@ -33,7 +33,6 @@ const MOST_HELD: u64 = 600 << 20;
 /// Bytes of all uploads that are in memory.
 static HELD: AtomicU64 = AtomicU64::new(0);
 
-/// A request.
 pub struct Request {
     /// The path, without query and fragment.
     pub path: String,
@@ -57,7 +56,6 @@ pub type Bytes = dyn AsRef<[u8]> + Send + Sync;
 /// Content of an answer.
 pub type Content = Arc<Bytes>;
 
-/// An answer.
 pub struct Answer {
     pub status: StatusCode,
     pub headers: Vec<(&'static str, String)>,

@@ -65,7 +65,6 @@ impl ViewFolder {
         remove(&cameras)
     }
 
-    /// Writes one view.
     pub fn write(&self, view: usize, picture: &RgbImage) -> Result<(), Failure> {
         write_png(&self.path.join(name(view)), picture)
     }

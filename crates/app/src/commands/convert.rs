@@ -67,7 +67,6 @@ fn is_page(output: &Path) -> bool {
     output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html"))
 }
 
-/// Converts one file.
 fn one(input: &Path, output: &Path, axes: &AxesArguments) -> Result<(), Failure> {
     let is_page = is_page(output);
     let kind = if is_page { Kind::Spz } else { Kind::of(output) };

@@ -26,7 +26,6 @@ pub struct Arguments {
 /// Approximate memory of a reconstruction with the default weights, in bytes (docs/weights.md).
 const COMFORTABLE: u64 = 1_000_000_000;
 
-/// Weights and their state.
 struct Weights {
     name: String,
     /// Their description, or their fault.

@@ -99,7 +99,6 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     })
 }
 
-/// Renders one file.
 fn one(arguments: &Arguments, device: &Device) -> Result<(), Failure> {
     let views = views(arguments)?;
     if arguments.raw.is_some() {
