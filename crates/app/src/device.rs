@@ -36,7 +36,8 @@ pub fn choose(name: &str) -> Result<Device, Failure> {
         }
         "cpu" | "flex" => return Ok(Device::flex()),
         #[cfg(feature = "gpu")]
-        "ndarray" => return Ok(ndarray()),
+        #[allow(deprecated, reason = "kept as the second CPU implementation")]
+        "ndarray" => return Ok(Device::ndarray()),
         _ => {}
     }
     match gpus().into_iter().find(|(compiled, ..)| *compiled == kind) {
@@ -226,12 +227,6 @@ fn identity(device: &Device) -> Option<(String, bool)> {
     #[cfg(not(feature = "gpu"))]
     let identity = (*device != Device::flex()).then(|| (String::new(), true));
     identity
-}
-
-#[cfg(feature = "gpu")]
-#[allow(deprecated, reason = "kept as the second CPU implementation")]
-fn ndarray() -> Device {
-    Device::ndarray()
 }
 
 /// The devices of a kind. Without a driver the graphics layer panics, and there are none.
