@@ -97,9 +97,8 @@ impl Body<'_> {
         let start = Instant::now();
         let mut part = vec![0; PART];
         while (upload.0.len() as u64) < length {
-            let left = time_left(start, upload.0.len() as u64).ok();
-            let left = left.filter(|left| self.stream.set_read_timeout(Some(*left)).is_ok());
-            left.ok_or(SLOW)?;
+            let left = time_left(start, upload.0.len() as u64);
+            self.stream.set_read_timeout(Some(left)).map_err(|_| SLOW)?;
             let wanted = (length - upload.0.len() as u64).min(PART as u64) as usize;
             match self.stream.read(&mut part[..wanted]) {
                 Ok(n) if n > 0 => upload.append(&part[..n])?,
@@ -205,7 +204,7 @@ fn converse(mut stream: TcpStream, answer: &dyn Fn(&Request, &mut Body) -> Answe
 /// Sends a part of an answer that began at `start`, after `sent` other bytes. Slow clients are dropped.
 fn send(stream: &mut TcpStream, mut part: &[u8], start: Instant, mut sent: u64) -> io::Result<()> {
     while !part.is_empty() {
-        stream.set_write_timeout(Some(time_left(start, sent)?))?;
+        stream.set_write_timeout(Some(time_left(start, sent)))?;
         match stream.write(part) {
             Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
             Ok(n) => {
@@ -219,11 +218,11 @@ fn send(stream: &mut TcpStream, mut part: &[u8], start: Instant, mut sent: u64) 
     Ok(())
 }
 
-/// The time that is left to a client who began at `start` and has read or written `bytes` bytes.
-fn time_left(start: Instant, bytes: u64) -> io::Result<Duration> {
+/// The time that is left to a client who began at `start` and has read or written `bytes` bytes. A socket refuses a
+/// timeout of 0.
+fn time_left(start: Instant, bytes: u64) -> Duration {
     let end = (ALLOWANCE + Duration::from_secs(bytes / SLOWEST)).min(LONGEST_ANSWER);
-    let left = end.saturating_sub(start.elapsed());
-    if left.is_zero() { Err(io::ErrorKind::TimedOut.into()) } else { Ok(left) }
+    end.saturating_sub(start.elapsed())
 }
 
 /// Reads a request line and its headers, and the part of the body that arrives with them.
@@ -232,11 +231,7 @@ fn request(stream: &mut TcpStream) -> io::Result<Result<(Request, Vec<u8>), Refu
     let mut bytes = Vec::new();
     let mut part = [0; 2048];
     loop {
-        let left = end.saturating_duration_since(Instant::now());
-        if left.is_zero() {
-            return Err(io::ErrorKind::TimedOut.into());
-        }
-        stream.set_read_timeout(Some(left))?;
+        stream.set_read_timeout(Some(end.saturating_duration_since(Instant::now())))?;
         let n = stream.read(&mut part)?;
         if n == 0 {
             return Err(io::ErrorKind::UnexpectedEof.into());
