@@ -240,12 +240,9 @@ fn contestants(
             Err(e) => missing.push(LeftOut::new(name, e)),
         }
     }
-    if config.baselines.billboard {
-        contestants.push(Contestant::Billboard(device.clone()));
-    }
-    if config.baselines.true_points {
-        contestants.push(Contestant::TruePoints(device.clone()));
-    }
+    let baselines = &config.baselines;
+    contestants.extend(baselines.billboard.then(|| Contestant::Billboard(device.clone())));
+    contestants.extend(baselines.true_points.then(|| Contestant::TruePoints(device.clone())));
     contestants
 }
 
