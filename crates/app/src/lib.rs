@@ -213,7 +213,7 @@ pub fn main(program: &[OsString], arguments: Vec<OsString>) -> u8 {
             }
             if !e.use_stderr() {
                 // Help and version are the result of the command.
-                return ended(say::written(e.print()).and_then(|()| say::result(b"")));
+                return ended(say::written(e.print()).and_then(|()| say::result(b"")).map(|()| 0));
             }
             say::err(e.to_string().trim_end());
             return e.exit_code() as u8;
@@ -233,8 +233,8 @@ pub fn main(program: &[OsString], arguments: Vec<OsString>) -> u8 {
         Command::Rig(arguments) => commands::rig::run(&arguments),
         Command::Convert(arguments) => commands::convert::run(&arguments),
         Command::Prepare(arguments) => commands::prepare::run(&arguments),
-        Command::TrainStage1(arguments) => return ended_with(commands::train::stage1(&arguments)),
-        Command::TrainStage2(arguments) => return ended_with(commands::train::stage2(&arguments)),
+        Command::TrainStage1(arguments) => return ended(commands::train::stage1(&arguments)),
+        Command::TrainStage2(arguments) => return ended(commands::train::stage2(&arguments)),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments),
         Command::Bench(arguments) => commands::bench::run(&arguments),
         Command::Stability(arguments) => commands::stability::run(&arguments),
@@ -248,7 +248,7 @@ pub fn main(program: &[OsString], arguments: Vec<OsString>) -> u8 {
         Command::Completions(arguments) => commands::manuals::completions(&arguments, Arguments::command()),
         Command::Man(arguments) => commands::manuals::pages(&arguments, Arguments::command()),
     };
-    ended(result)
+    ended(result.map(|()| 0))
 }
 
 /// Refuses a number of threads at whose start the program would hang.
@@ -262,11 +262,7 @@ fn check_threads() -> Result<(), Failure> {
     }
 }
 
-fn ended(result: Result<(), Failure>) -> u8 {
-    ended_with(result.map(|()| 0))
-}
-
-fn ended_with(result: Result<u8, Failure>) -> u8 {
+fn ended(result: Result<u8, Failure>) -> u8 {
     result.unwrap_or_else(|failure| {
         say::err(&format!("error: {failure}"));
         failure.code()
