@@ -333,19 +333,6 @@ mod tests {
     }
 
     #[test]
-    #[cfg(unix)]
-    fn a_write_protected_file_is_kept() {
-        use std::os::unix::fs::PermissionsExt;
-        let folder = tempfile::tempdir().expect("temporary folder");
-        let path = folder.path().join("a.txt");
-        fs::write(&path, "old").expect("write");
-        fs::set_permissions(&path, fs::Permissions::from_mode(0o444)).expect("chmod");
-        let refused = write_whole::<io::Error>(&path, |out| out.write_all(b"new"));
-        assert!(refused.expect_err("refuses").to_string().contains("write-protected"));
-        assert_eq!(fs::read_to_string(&path).expect("read"), "old");
-    }
-
-    #[test]
     fn what_a_killed_run_left_is_removed_and_what_is_being_written_is_not() {
         let folder = tempfile::tempdir().expect("temporary folder");
         let [path, left, other] =
