@@ -76,12 +76,12 @@ fn draw(area: &Area, axes: &Axes, series: &[Series]) -> Drawn {
         let values = drawable(axes, series).map(of);
         let (low, high) = values.fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
         let room = 0.05 * (high - low).max(1e-3 * high.abs()).max(1e-9);
-        if log { (0.9 * low..1.1 * high, true) } else { (low - room..high + room, false) }
+        if log { 0.9 * low..1.1 * high } else { low - room..high + room }
     };
     if drawable(axes, series).next().is_none() {
         return Ok(());
     }
-    let ((x, log_x), (y, log_y)) = (bounds(|p| p.0, axes.log_x), bounds(|p| p.1, axes.log_y));
+    let (x, y) = (bounds(|p| p.0, axes.log_x), bounds(|p| p.1, axes.log_y));
     let (plot, names) = area.split_horizontally(SIZE.0 - NAMES);
     let mut builder = ChartBuilder::on(&plot);
     builder.caption(axes.caption, ("sans-serif", 16)).margin(10).x_label_area_size(36).y_label_area_size(60);
@@ -115,7 +115,7 @@ fn draw(area: &Area, axes: &Axes, series: &[Series]) -> Drawn {
         let ticks = ticks(&range);
         range.log_scale().with_key_points(ticks)
     };
-    match (log_x, log_y) {
+    match (axes.log_x, axes.log_y) {
         (false, false) => chart!(x, y),
         (true, false) => chart!(log(x), y),
         (false, true) => chart!(x, log(y)),
@@ -155,31 +155,25 @@ fn number(value: f64) -> String {
 mod tests {
     use super::*;
 
+    fn drawn(log_x: bool, points: Vec<(f64, f64)>) -> String {
+        let axes = Axes { caption: "c", x: "x", y: "y", log_x, ..Axes::default() };
+        svg(&[(axes, vec![Series { name: "a < b".into(), points, line: true }])])
+    }
+
     #[test]
     fn values_beyond_all_axes_are_left_out() {
-        let axes = || Axes { caption: "c", x: "x", y: "y", ..Axes::default() };
-        let series = |points: Vec<(f64, f64)>| vec![Series { name: "a < b".into(), points, line: true }];
-        let drawn = svg(&[(
-            axes(),
-            series(vec![(0.0, 1.0), (1.0, -1e308), (2.0, 1e308), (3.0, f64::NAN), (4.0, 2.0)]),
-        )]);
+        let points = vec![(0.0, 1.0), (1.0, -1e308), (2.0, 1e308), (3.0, f64::NAN), (4.0, 2.0)];
+        let drawn_points = drawn(false, points);
         // Two points, and the mark in the legend.
-        assert_eq!(drawn.matches("<circle").count(), 3, "{drawn}");
-        assert!(drawn.contains("a &lt; b"));
-        assert_eq!(svg(&[(axes(), series(vec![(f64::INFINITY, 1.0)]))]), "");
+        assert_eq!(drawn_points.matches("<circle").count(), 3, "{drawn_points}");
+        assert!(drawn_points.contains("a &lt; b"));
+        assert_eq!(drawn(false, vec![(f64::INFINITY, 1.0)]), "");
     }
 
     #[test]
     fn a_logarithmic_axis_has_ticks_within_a_power_of_ten_too() {
-        let axes = || Axes { caption: "c", x: "x", y: "y", log_x: true, ..Axes::default() };
-        let drawn = |last: f64| {
-            svg(&[(
-                axes(),
-                vec![Series { name: "n".into(), points: vec![(3000.0, 1.0), (last, 2.0)], line: true }],
-            )])
-        };
         for (last, ticks) in [(4800.0, [3000, 3500, 4500]), (90_000.0, [5000, 20_000, 50_000])] {
-            let drawn = drawn(last);
+            let drawn = drawn(true, vec![(3000.0, 1.0), (last, 2.0)]);
             // Labels stand on lines of their own.
             assert!(ticks.iter().all(|tick| drawn.contains(&format!("\n{tick}\n"))), "{drawn}");
         }
@@ -187,16 +181,7 @@ mod tests {
 
     #[test]
     fn numbers_are_short() {
-        let cases = [
-            (0.0, "0"),
-            (20_000.0, "20000"),
-            (0.05, "0.05"),
-            (-1.5, "-1.5"),
-            (1234.5, "1234"),
-            (3e-12, "3.00e-12"),
-        ];
-        for (value, expected) in cases {
-            assert_eq!(number(value), expected);
-        }
+        let shown = [0.0, 20_000.0, 0.05, -1.5, 1234.5, 3e-12].map(number);
+        assert_eq!(shown, ["0", "20000", "0.05", "-1.5", "1234", "3.00e-12"]);
     }
 }
