@@ -90,85 +90,71 @@ impl Evaluation<'_> {
     /// What the photographs' backgrounds left in the people.
     fn photographs_markdown(&self, text: &mut String) {
         let found = self.outcome.judged.iter().map(|judged| (judged, Self::photographs(judged)));
-        let rows: Vec<Vec<String>> = found
-            .filter(|(_, shares)| shares.iter().any(Option::is_some))
-            .map(|(judged, [masks, foreign, beside])| {
-                let shares = [foreign, beside].map(|share| cell(share, 100.0, 2));
-                [vec![judged.name.clone(), cell(masks, 1.0, 4)], shares.into()].concat()
-            })
-            .collect();
-        if !rows.is_empty() {
-            let header = ["", "IoU of the masks", "foreign colour, %", "beside the person, %"];
-            let _ = writeln!(
-                text,
-                "## Photographs\n\nIoU of the cut-outs and the true masks. In the views from 45° to 135°, pixels in a colour of the background \
-                 instead of the person's, and pixels that show something outside of the grown true mask, as shares of the \
-                 person's pixels.\n\n{}",
-                table_markdown(&header, rows.into_iter())
-            );
-        }
+        let found = found.filter(|(_, shares)| shares.iter().any(Option::is_some));
+        let row = |(judged, [masks, foreign, beside]): (&Judged, [Option<Interval>; 3])| {
+            let shares = [foreign, beside].map(|share| cell(share, 100.0, 2));
+            [vec![judged.name.clone(), cell(masks, 1.0, 4)], shares.into()].concat()
+        };
+        section(
+            text,
+            "## Photographs\n\nIoU of the cut-outs and the true masks. In the views from 45° to 135°, pixels in a colour of the background \
+             instead of the person's, and pixels that show something outside of the grown true mask, as shares of the \
+             person's pixels.",
+            &["", "IoU of the masks", "foreign colour, %", "beside the person, %"],
+            found.map(row),
+        );
     }
 
     fn geometry_markdown(&self, text: &mut String) {
         let made: Vec<&Judged> = self.outcome.judged.iter().filter(|j| !j.gaussians.is_empty()).collect();
-        let with_points: Vec<&&Judged> = made.iter().filter(|judged| !judged.points.is_empty()).collect();
-        if !with_points.is_empty() {
-            let row = |judged: &&Judged| -> Vec<String> {
-                let views = (0..VIEWS.len()).map(|view| match point_means(judged, view) {
-                    Some([mean, centred, missed]) => {
-                        format!("{mean:.1} ({centred:.1}), {:.1} %", 100.0 * missed)
-                    }
-                    None => "n/a".into(),
-                });
-                [judged.name.clone()].into_iter().chain(views).collect()
-            };
-            let _ = writeln!(
-                text,
-                "## Points\n\nMean distance from the ground-truth points, mm; in brackets after the mean shift of each person's front and \
-                 back is removed; then the share of ground-truth points without a prediction.\n\n{}",
-                table_markdown(&[&[""][..], &VIEWS].concat(), with_points.into_iter().map(row))
-            );
-        }
+        let with_points = made.iter().filter(|judged| !judged.points.is_empty());
+        let row = |judged: &&Judged| {
+            let views = (0..VIEWS.len()).map(|view| match point_means(judged, view) {
+                Some([mean, centred, missed]) => format!("{mean:.1} ({centred:.1}), {:.1} %", 100.0 * missed),
+                None => "n/a".into(),
+            });
+            [judged.name.clone()].into_iter().chain(views).collect()
+        };
+        section(
+            text,
+            "## Points\n\nMean distance from the ground-truth points, mm; in brackets after the mean shift of each person's front and \
+             back is removed; then the share of ground-truth points without a prediction.",
+            &[&[""][..], &VIEWS].concat(),
+            with_points.map(row),
+        );
         let with_parts = made.iter().filter(|judged| !judged.parts.is_empty());
-        let rows: Vec<Vec<String>> = with_parts
-            .map(|judged| {
-                let shown =
-                    |figure: Option<f64>| figure.map_or("n/a".into(), |figure| format!("{figure:.1}"));
-                let parts = (0..PARTS.len()).map(|part| {
-                    let [relief, normals, far] = part_means(judged, part).map(shown);
-                    format!("{relief}, {normals}°, {far} %")
-                });
-                [judged.name.clone()].into_iter().chain(parts).collect()
-            })
-            .collect();
-        if !rows.is_empty() {
-            let _ = writeln!(
-                text,
-                "## Parts of the body\n\nIn the photographs: mean distance in mm from the ground-truth points after the part's median shift \
-                 is removed; mean angle between the normals; share of points that are 4 cm or more away, which the mean leaves out.\n\n{}",
-                table_markdown(&[&[""][..], &PARTS].concat(), rows.into_iter())
-            );
-        }
+        let row = |judged: &&Judged| {
+            let shown = |figure: Option<f64>| figure.map_or("n/a".into(), |figure| format!("{figure:.1}"));
+            let parts = (0..PARTS.len()).map(|part| {
+                let [relief, normals, far] = part_means(judged, part).map(shown);
+                format!("{relief}, {normals}°, {far} %")
+            });
+            [judged.name.clone()].into_iter().chain(parts).collect()
+        };
+        section(
+            text,
+            "## Parts of the body\n\nIn the photographs: mean distance in mm from the ground-truth points after the part's median shift \
+             is removed; mean angle between the normals; share of points that are 4 cm or more away, which the mean leaves out.",
+            &[&[""][..], &PARTS].concat(),
+            with_parts.map(row),
+        );
         let centres = made.iter().map(|judged| (judged.name.clone(), &judged.surface));
         let meshes = made.iter().map(|judged| (format!("{}, mesh", judged.name), &judged.mesh));
-        let surfaces: Vec<_> = centres.chain(meshes).filter(|(_, found)| !found.is_empty()).collect();
-        if !surfaces.is_empty() {
-            let row = |(name, found): (String, &Vec<Surface>)| {
-                let [forward, backward, mean, normals, open] = surface_intervals(found);
-                let distances = [forward, backward, mean].map(|distance| cell(distance, 1.0, 2));
-                [vec![name], distances.into(), vec![cell(normals, 1.0, 3), cell(open, 100.0, 2)]].concat()
-            };
-            let header = ["", "to the truth", "from the truth", "Chamfer", "normals", "open, %"];
-            let _ = writeln!(
-                text,
-                "## Surface\n\nDistances in cm between the ground-truth points of all views and the centres of the \
-                 Gaussians with an opacity of at least {OPAQUE}, or points drawn from the meshes of the Gaussians; normals: mean cosine from \
-                 the views nearest to 0, 90, 180 and 270°, in maps of 256² at most; open: share of the person's pixels that are covered by \
-                 less than 90 % or show a surface more than 6 cm behind the true one, from the views nearest to every 45°, without the rim \
-                 and without steps of the true depth.\n\n{}",
-                table_markdown(&header, surfaces.into_iter().map(row))
-            );
-        }
+        let surfaces = centres.chain(meshes).filter(|(_, found)| !found.is_empty());
+        let row = |(name, found): (String, &Vec<Surface>)| {
+            let [forward, backward, mean, normals, open] = surface_intervals(found);
+            let distances = [forward, backward, mean].map(|distance| cell(distance, 1.0, 2));
+            [vec![name], distances.into(), vec![cell(normals, 1.0, 3), cell(open, 100.0, 2)]].concat()
+        };
+        let about = format!(
+            "## Surface\n\nDistances in cm between the ground-truth points of all views and the centres of the \
+             Gaussians with an opacity of at least {OPAQUE}, or points drawn from the meshes of the Gaussians; normals: mean cosine from \
+             the views nearest to 0, 90, 180 and 270°, in maps of 256² at most; open: share of the person's pixels that are covered by \
+             less than 90 % or show a surface more than 6 cm behind the true one, from the views nearest to every 45°, without the rim \
+             and without steps of the true depth."
+        );
+        let header = ["", "to the truth", "from the truth", "Chamfer", "normals", "open, %"];
+        section(text, &about, &header, surfaces.map(row));
         let row = |judged: &Judged| {
             let times =
                 seconds(judged).map_or(["n/a".into(), "n/a".into()], |p| p.map(|s| format!("{s:.3}")));
@@ -186,6 +172,14 @@ impl Evaluation<'_> {
             seconds / views.max(1) as f64,
             table_markdown(&["", "seconds a person, p50", "p95", "Gaussians"], made.into_iter().map(row))
         );
+    }
+}
+
+/// A heading, what a table shows, and the table, unless it is empty.
+fn section(text: &mut String, about: &str, header: &[&str], rows: impl Iterator<Item = Vec<String>>) {
+    let mut rows = rows.peekable();
+    if rows.peek().is_some() {
+        let _ = writeln!(text, "{about}\n\n{}", table_markdown(header, rows));
     }
 }
 
