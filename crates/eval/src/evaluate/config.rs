@@ -225,22 +225,7 @@ impl EvalConfig {
         let others = self.ablations.clone().into_iter().map(|(name, other)| (name, other.over(&model)));
         [("model".to_owned(), model.clone())].into_iter().chain(others).collect()
     }
-}
 
-impl Schema for EvalConfig {
-    fn refusal(&self) -> Option<(String, String)> {
-        let of_variant = |(section, variant): (String, &Variant)| {
-            let of_benchmarks = |key| (key, "only settings of `snapsnap bench` have this key".to_owned());
-            let problem = variant.refusal().or_else(|| variant.key_of_benchmarks().map(of_benchmarks));
-            problem.map(|(key, message)| (format!("{section}.{key}"), message))
-        };
-        let ablations = self.ablations.iter().map(|(name, ablation)| (format!("ablations.{name}"), ablation));
-        let problem = self.problem().map(|(key, message)| (key.to_owned(), message));
-        problem.or_else(|| ablations.chain([("model".into(), &self.model)]).find_map(of_variant))
-    }
-}
-
-impl EvalConfig {
     fn problem(&self) -> Option<(&'static str, String)> {
         /// Names that have another meaning in reports.
         const TAKEN: [&str; 4] = ["model", "against", "billboard", "true_points"];
@@ -275,5 +260,18 @@ impl EvalConfig {
             ("report.degrees", report.degrees.iter().any(|d| !d.is_finite()), "must be numbers"),
         ];
         problems.into_iter().find_map(|(key, is_wrong, message)| is_wrong.then(|| (key, message.into())))
+    }
+}
+
+impl Schema for EvalConfig {
+    fn refusal(&self) -> Option<(String, String)> {
+        let of_variant = |(section, variant): (String, &Variant)| {
+            let of_benchmarks = |key| (key, "only settings of `snapsnap bench` have this key".to_owned());
+            let problem = variant.refusal().or_else(|| variant.key_of_benchmarks().map(of_benchmarks));
+            problem.map(|(key, message)| (format!("{section}.{key}"), message))
+        };
+        let ablations = self.ablations.iter().map(|(name, ablation)| (format!("ablations.{name}"), ablation));
+        let problem = self.problem().map(|(key, message)| (key.to_owned(), message));
+        problem.or_else(|| ablations.chain([("model".into(), &self.model)]).find_map(of_variant))
     }
 }
