@@ -116,22 +116,19 @@ impl Contestant {
             Self::Model(.., model) => {
                 let is_changed = model.photographs != PhotographChanges::default();
                 let own = is_changed.then(|| people.item(row, inputs, &model.photographs)).transpose()?;
-                let true_masks = &item.photographs;
-                let unchanged = item;
-                let item = own.as_ref().unwrap_or(item);
-                let mut made = model.reconstruct(item, inputs)?;
-                let front = &item.cameras[inputs[0]];
+                let changed = own.as_ref().unwrap_or(item);
+                let mut made = model.reconstruct(changed, inputs)?;
+                let front = &changed.cameras[inputs[0]];
                 let align = || aligned(&mut made.gaussians, &mut made.maps, metrics, truth, front);
                 let aligned = (metrics.align != Align::None).then(align).transpose()?;
                 // Pictures can be compared without errors of points.
-                let points = errors(people, row, unchanged, inputs, &made.maps, model.side());
-                let points = points.map_err(|e| e.to_string());
+                let points = errors(people, row, item, inputs, &made.maps, model.side());
                 let has_background = model.photographs.has_background();
                 Ok(Shown {
-                    points,
+                    points: points.map_err(|e| e.to_string()),
                     lost: made.lost,
                     masks: made.masks,
-                    palette: has_background.then(|| Palette::new(&item.photographs, true_masks)),
+                    palette: has_background.then(|| Palette::new(&changed.photographs, &item.photographs)),
                     time: Some(made.time),
                     aligned,
                     ..plain(made.gaussians)?

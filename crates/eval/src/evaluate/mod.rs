@@ -218,22 +218,20 @@ impl Place<'_> {
             self.left_out(outcome, &name, why);
         }
         let judged = &mut outcome.judged[i];
-        if let Some((points, parts)) = points {
-            judged.points.extend(points);
-            judged.parts.extend(parts);
-        }
+        let (points, parts) = points.unwrap_or_default();
+        judged.points.extend(points);
+        judged.parts.extend(parts);
         judged.masks.extend(made.masks);
         judged.times.extend(made.time);
         judged.gaussians.push(made.gaussians.len());
         judged.aligned.extend(made.aligned);
-        let is_baseline = judged.kind == Kind::Baseline;
         let (Some(truth), gaussians) = (truth, &made.gaussians) else { return };
         if config.metrics.geometry {
             let surface = Surface::of_gaussians(gaussians, truth);
             let surface = self.kept(outcome, &format!("{name}, geometry"), surface);
             outcome.judged[i].surface.extend(surface);
         }
-        if config.metrics.mesh && !is_baseline {
+        if config.metrics.mesh && self.contestants[i].kind() != Kind::Baseline {
             let mesh = self.kept(outcome, &format!("{name}, mesh"), Surface::of_mesh(gaussians, truth));
             outcome.judged[i].mesh.extend(mesh);
         }
