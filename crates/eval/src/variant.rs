@@ -63,17 +63,12 @@ impl Variant {
         let mut keys = base.keys();
         keys.extend(self.keys());
         let merged = serde_json::from_value(Value::Object(keys)).expect("keys of variants");
-        Self {
-            weights: self.weights.or(base.weights.clone()),
-            set: [base.set.clone(), self.set].concat(),
-            ..merged
-        }
+        Self { set: [base.set.clone(), self.set].concat(), ..merged }
     }
 
-    /// The set keys with their values, except `weights`: JSON cannot express a path that is not UTF-8.
+    /// The set keys with their values. Paths are UTF-8, as the commands check.
     fn keys(&self) -> Map<String, Value> {
-        let variant = json!(Self { weights: None, ..self.clone() });
-        let Value::Object(mut keys) = variant else { unreachable!("a variant has keys") };
+        let Value::Object(mut keys) = json!(self) else { unreachable!("a variant has keys") };
         keys.retain(|_, value| !value.is_null());
         keys
     }
