@@ -300,23 +300,19 @@ mod tests {
     #[test]
     fn weights_of_something_else_are_refused_by_name() {
         let folder = tempfile::tempdir().expect("a folder");
-        let problems = |tensors: &[(String, Vec<usize>, Vec<f32>)], name: &str| {
-            let file = written(folder.path(), tensors, name);
-            Lpips::load(&[file], &Device::flex()).expect_err("no LPIPS").to_string()
-        };
         let whole = tensors();
-        let said = problems(&whole[1..], "less");
-        assert!(said.contains("missing: features.0.weight [64, 3, 11, 11]"), "{said}");
         let mut other = whole.clone();
         other[2].1 = vec![64, 1, 1, 1];
-        assert!(problems(&other, "other").contains("mis-shaped: lin0.model.1.weight"));
-        let mut more = whole.clone();
-        more.push(("features.12.weight".into(), vec![1], vec![0.0]));
-        assert!(problems(&more, "more").contains("not part of AlexNet or LPIPS: features.12.weight"));
-        let file = written(folder.path(), &whole, "twice");
-        let said = Lpips::load(&[file.clone(), file], &Device::flex()).expect_err("twice").to_string();
-        assert!(said.contains("given twice: features.0.weight"), "{said}");
-        let said = Lpips::load(&[PathBuf::from("nowhere.pth")], &Device::flex()).expect_err("nothing");
-        assert!(said.to_string().contains("nowhere.pth"));
+        let more = [&whole[..], &[("features.12.weight".into(), vec![1], vec![0.0])]].concat();
+        for (files, problem) in [
+            (vec![written(folder.path(), &whole[1..], "less")], "missing: features.0.weight [64, 3, 11, 11]"),
+            (vec![written(folder.path(), &other, "other")], "mis-shaped: lin0.model.1.weight"),
+            (vec![written(folder.path(), &more, "more")], "not part of AlexNet or LPIPS: features.12.weight"),
+            (vec![written(folder.path(), &whole, "twice"); 2], "given twice: features.0.weight"),
+            (vec!["nowhere.pth".into()], "nowhere.pth"),
+        ] {
+            let said = Lpips::load(&files, &Device::flex()).expect_err("no LPIPS").to_string();
+            assert!(said.contains(problem), "{said}");
+        }
     }
 }
