@@ -87,12 +87,9 @@ pub fn truth(people: &People, row: usize) -> Result<Truth> {
         Ok((kept, seen))
     };
     let numbered: Vec<(usize, &Camera)> = cameras.iter().enumerate().collect();
-    let mut found = Vec::new();
-    for views in numbered.chunks(at_once(people.folder.description().resolution as usize)) {
-        let part: Result<Vec<_>> = views.par_iter().map(|view| of_view(*view)).collect();
-        found.extend(part?);
-    }
-    let (points, views): (Vec<_>, Vec<_>) = found.into_iter().unzip();
+    let parts = numbered.chunks(at_once(people.folder.description().resolution as usize));
+    let found = parts.map(|views| views.par_iter().map(|view| of_view(*view)).collect::<Result<Vec<_>>>());
+    let (points, views): (Vec<_>, Vec<_>) = found.collect::<Result<Vec<_>>>()?.into_iter().flatten().unzip();
     let truth = Truth { points: points.concat(), views: views.into_iter().flatten().collect() };
     if truth.points.is_empty() {
         return Err(EvalError::new("no view has a depth: there is no ground truth"));
