@@ -133,9 +133,7 @@ mod tests {
     #[test]
     fn masks_overlap_by_their_common_pixels() {
         let mask = |from: u32| GrayImage::from_fn(8, 4, |x, _| Luma([if x >= from { 200 } else { 100 }]));
-        assert_eq!(
-            [overlap(&mask(4), &mask(6)), overlap(&mask(3), &mask(3)), overlap(&mask(8), &mask(8))],
-            [0.5, 1.0, 0.0]
-        );
+        let shares = [(4, 6), (3, 3), (8, 8)].map(|(a, b)| overlap(&mask(a), &mask(b)));
+        assert_eq!(shares, [0.5, 1.0, 0.0]);
     }
 }
