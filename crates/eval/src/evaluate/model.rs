@@ -56,8 +56,7 @@ impl Model {
     /// # Errors
     /// [`WeightsError`] if a part is absent or a value is not finite.
     pub fn load(weights: &WeightFile, device: &Device, variant: &Variant) -> Result<Self, WeightsError> {
-        let own = || Precision::of_weights(&weights.config, device);
-        let precision = variant.precision.unwrap_or_else(own);
+        let precision = variant.precision.unwrap_or_else(|| Precision::of_weights(&weights.config, device));
         let mut reconstructor = Reconstructor::load(weights, device)?.in_precision(precision);
         // Scenes of more than two photographs have no unseen sides.
         let is_pair = variant.inputs.as_ref().is_none_or(|inputs| inputs.len() <= 2);
@@ -67,11 +66,8 @@ impl Model {
         if variant.side_colors == Some(false) {
             reconstructor = reconstructor.without_side_colors();
         }
-        Ok(Self {
-            reconstructor,
-            photographs: variant.photographs.unwrap_or_default(),
-            variant: variant.clone(),
-        })
+        let photographs = variant.photographs.unwrap_or_default();
+        Ok(Self { reconstructor, photographs, variant: variant.clone() })
     }
 
     /// Side of the canvas.
@@ -96,10 +92,8 @@ impl Model {
     fn canvases(&self, item: &TestItem, cutting: Cutting) -> Result<Photographs> {
         let (config, name) = (self.reconstructor.config(), Path::new(&item.subject));
         let knows_masks = cutting == Cutting::Given;
-        let sources = item
-            .photographs
-            .iter()
-            .map(|(rgb, mask)| Picture::pixels(name, rgb, knows_masks.then_some(mask)));
+        let photographs = item.photographs.iter();
+        let sources = photographs.map(|(rgb, mask)| Picture::pixels(name, rgb, knows_masks.then_some(mask)));
         let placement = Told::default().placement(config);
         Ok(snapsnap_photo::read(&sources.collect::<Vec<_>>(), cutting, self.side(), placement, None)?)
     }
@@ -181,27 +175,17 @@ impl Model {
             let second = (first + 1) % inputs.len();
             let camera = &item.cameras[inputs[first]];
             self.check_pair(degrees(&item.cameras[inputs[second]], camera))?;
-            let made = snapsnap_photo::reconstruct(
-                &self.reconstructor,
-                [&photographs[first], &photographs[second]],
-                &|_| (),
-            );
+            let pair = [&photographs[first], &photographs[second]];
+            let made = snapsnap_photo::reconstruct(&self.reconstructor, pair, &|_| ());
             let mut to_world = camera.world_to_camera.inverse();
             // With several pairs, the second photograph is the first photograph of the next pair.
             let (mut gaussians, origins) = self.thinned(made.gaussians.clone(), &made.origins, count > 1);
             if let Some(frames) = frames {
                 // With several pairs, the second photograph shows a neighbouring view, not the back.
-                let opposite = camera.turned(180.0);
-                let (other, frame) = if count == 1 {
-                    (&item.cameras[inputs[1]], &frames[1])
-                } else {
-                    (&opposite, &frames[first])
-                };
-                let restoration = Restoration::to_cameras(
-                    [camera, other],
-                    [&frames[first].mapping, &frame.mapping],
-                    side as u32,
-                );
+                let (other, back) =
+                    if count == 1 { (item.cameras[inputs[1]], 1) } else { (camera.turned(180.0), first) };
+                let mappings = [first, back].map(|i| &frames[i].mapping);
+                let restoration = Restoration::to_cameras([camera, &other], mappings, side as u32);
                 gaussians = restoration.person(gaussians, &origins);
                 to_world = restoration.front.world_to_camera.inverse();
             }
