@@ -115,16 +115,11 @@ mod tests {
         let found = part_errors(&pair, &joints, side);
         let [head, hand] = found[..] else { panic!("{found:?}") };
         assert_eq!((head.part, hand.part), (0, 1));
-        assert!(
-            head.relief.is_some_and(|relief| (relief - 0.004).abs() < 2e-4) && head.far == 0.0,
-            "{head:?}"
-        );
+        let is_near = |found: Option<f64>, at: f64, most| found.is_some_and(|v| (v - at).abs() < most);
+        assert!(is_near(head.relief, 0.004, 2e-4) && head.far == 0.0, "{head:?}");
         // Slopes of 8 mm over 2 mm.
         let slope = 4.0_f64.atan().to_degrees();
-        assert!(head.normals.is_some_and(|degrees| (degrees - slope).abs() < 0.5), "{head:?}");
-        assert!(
-            hand.relief.is_some_and(|relief| relief < 1e-6) && (hand.far - 0.25).abs() < 0.03,
-            "{hand:?}"
-        );
+        assert!(is_near(head.normals, slope, 0.5), "{head:?}");
+        assert!(is_near(hand.relief, 0.0, 1e-6) && is_near(Some(hand.far), 0.25, 0.03), "{hand:?}");
     }
 }
