@@ -97,9 +97,8 @@ mod tests {
             joints[row] = joint(x, y);
         }
         joints[19] = joint(40.0, 150.0);
-        let truth: Vec<f32> = (0..side * side)
-            .flat_map(|i| [0.002 * (i % side) as f32, 0.002 * (i / side) as f32, 2.0])
-            .collect();
+        let point = |i: usize| [0.002 * (i % side) as f32, 0.002 * (i / side) as f32, 2.0];
+        let truth: Vec<f32> = (0..side * side).flat_map(point).collect();
         // The head is 5 cm off, every second column of it 8 mm more; the hand 1 m off in a quarter of its rows.
         let mut points = truth.clone();
         for (i, point) in points.as_chunks_mut::<3>().0.iter_mut().enumerate() {

@@ -120,9 +120,8 @@ fn find(folder: &Path, names: &[&str]) -> Result<PathBuf> {
     let files = names.iter().flat_map(|name| {
         // Collections of scans have a folder for each scan.
         let in_folder = format!("{name}/{}", name.rsplit('/').next().unwrap_or(name));
-        [(*name).to_owned(), in_folder]
-            .into_iter()
-            .flat_map(|stem| EXTENSIONS.map(|end| format!("{stem}.{end}")))
+        let stems = [(*name).to_owned(), in_folder].into_iter();
+        stems.flat_map(|stem| EXTENSIONS.map(|end| format!("{stem}.{end}")))
     });
     let found = files.map(|file| folder.join(file)).find(|file| file.is_file());
     found.ok_or_else(|| {
