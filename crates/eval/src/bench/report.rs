@@ -256,16 +256,13 @@ impl Bench<'_> {
     /// Validations of one kind over wall-clock time.
     fn curves(&self, what: &str) -> String {
         let alike = self.training.iter().filter(|t| t.what == what);
-        let series: Vec<Series> = alike
-            .map(|t| Series {
-                name: t.name.clone(),
-                points: t.points.iter().map(|(s, v)| (s / 60.0, *v)).collect(),
-                line: true,
-            })
-            .collect();
+        let curve = |t: &Training| {
+            let points = t.points.iter().map(|(s, v)| (s / 60.0, *v)).collect();
+            Series { name: t.name.clone(), points, line: true }
+        };
         let caption = "Validation against wall-clock time";
         let axes = Axes { caption, x: "minutes", y: what, ..Axes::default() };
-        svg(&[(axes, series)])
+        svg(&[(axes, alike.map(curve).collect())])
     }
 
     /// File names and texts of the plots. A plot without points is empty.

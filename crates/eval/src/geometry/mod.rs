@@ -137,13 +137,12 @@ pub fn point_to_surface(points: &[[f32; 3]], mesh: &Mesh) -> Result<f64> {
 pub fn sampled(mesh: &Mesh, count: usize, seed: u64) -> Result<Vec<[f32; 3]>> {
     let corners = |face: usize| mesh.faces[face].positions.map(|row| mesh.positions[row as usize].as_dvec3());
     let mut total = 0.0;
-    let areas: Vec<f64> = (0..mesh.faces.len())
-        .map(|face| {
-            let [a, b, c] = corners(face);
-            total += 0.5 * (b - a).cross(c - a).length();
-            total
-        })
-        .collect();
+    let area_up_to = |face: usize| {
+        let [a, b, c] = corners(face);
+        total += 0.5 * (b - a).cross(c - a).length();
+        total
+    };
+    let areas: Vec<f64> = (0..mesh.faces.len()).map(area_up_to).collect();
     if !(total > 0.0 && total.is_finite()) {
         return Err(EvalError::new("the mesh has no area"));
     }

@@ -100,9 +100,8 @@ fn gradient_of_sum<const D: usize, const E: usize>(of: &Tensor<D>, x: &Tensor<E>
 /// Raw points of one norm in several directions, against values and derivatives in f64.
 fn exponential_depth(norm: f32, device: &Device) -> Found {
     let directions: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.6, 0.0, -0.8], [-0.48, 0.6, 0.64]];
-    let raw: Vec<f32> = (0..4)
-        .flat_map(|c| directions.map(|d| if c < 3 { (d[c] * f64::from(norm)) as f32 } else { 0.0 }))
-        .collect();
+    let channel = |c: usize| directions.map(|d| if c < 3 { (d[c] * f64::from(norm)) as f32 } else { 0.0 });
+    let raw: Vec<f32> = (0..4).flat_map(channel).collect();
     let config = NetworkConfig { anchor: Anchor::None, ..NetworkConfig::default() };
     let x = tracked(raw.clone(), [1, 4, 1, 3], device);
     let points = activate(x.clone(), &config).points;
@@ -165,11 +164,8 @@ fn confidences(mode: ConfMode, device: &Device) -> Found {
 }
 
 fn attributes(device: &Device) -> Found {
-    let rows: Vec<f32> = [1e4_f32, -1e4]
-        .iter()
-        .flat_map(|v| (0..14).map(move |i| if i % 2 == 0 { *v } else { -*v }))
-        .collect();
-    let x = tracked(rows, [2, 14], device);
+    let row = |v: f32| [v, -v].repeat(7);
+    let x = tracked([row(1e4), row(-1e4)].concat(), [2, 14], device);
     let made = Attributes::new(x.clone(), None);
     let made = Tensor::cat(vec![made.opacity, made.scale, made.rotation, made.color, made.offset], 1);
     let gradient = gradient_of_sum(&made, &x);

@@ -173,9 +173,8 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Result<Foun
     let expected = reference::render(&scene, camera, &options, Cutoff::Hard);
     let banded = reference::banded(&scene, camera, &options);
     let mut random = ChaCha8Rng::seed_from_u64(3);
-    let mut upstream: Vec<[f64; 5]> = (0..expected.len())
-        .map(|_| [(); 5].map(|()| f64::from(random.random_range(-1.0_f32..1.0))))
-        .collect();
+    let mut weights = || [(); 5].map(|()| f64::from(random.random_range(-1.0_f32..1.0)));
+    let mut upstream: Vec<[f64; 5]> = expected.iter().map(|_| weights()).collect();
     // Pixels at which rounding may change a cut-off are not compared.
     upstream.iter_mut().zip(&banded).filter(|(_, banded)| **banded).for_each(|(u, _)| *u = [0.0; 5]);
 
@@ -240,16 +239,15 @@ fn unit(row: &Row, parameter: usize, camera: &Camera) -> f64 {
 /// Ten thousand nearly opaque Gaussians, one behind the other.
 fn many_on_one_pixel(device: &Device) -> Result<Found, SplatError> {
     let mut random = ChaCha8Rng::seed_from_u64(5);
-    let rows: Vec<Row> = (0..10_000)
-        .map(|i| {
-            let mut row = [0.0; 14];
-            row[2] = 1.0 + i as f32 * 1e-3;
-            (row[3], row[10]) = (1.0, 1.0);
-            row[7..10].fill(0.05);
-            row[11..].copy_from_slice(&[(); 3].map(|()| random.random::<f32>()));
-            row
-        })
-        .collect();
+    let row = |i: i32| {
+        let mut row = [0.0; 14];
+        row[2] = 1.0 + i as f32 * 1e-3;
+        (row[3], row[10]) = (1.0, 1.0);
+        row[7..10].fill(0.05);
+        row[11..].copy_from_slice(&[(); 3].map(|()| random.random::<f32>()));
+        row
+    };
+    let rows: Vec<Row> = (0..10_000).map(row).collect();
     let camera = camera(9, 9, 10.0);
     let options = RenderOptions::inria();
     let tracked = tracked(rows.concat(), [rows.len(), 14], device);
