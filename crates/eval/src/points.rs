@@ -97,7 +97,7 @@ mod tests {
     fn normals_differ_by_the_angle_between_the_surfaces() {
         // A wall, and the same wall turned about the vertical by 30°, seen in 4 × 3 pixels of a centimetre.
         let wall = |slope: f32| -> Vec<f32> {
-            let point = |i| [0.01 * (i % 4) as f32, 0.01 * (i / 4) as f32, 2.0 + slope * (i % 4) as f32];
+            let point = |i: i32| [0.01 * (i % 4) as f32, 0.01 * (i / 4) as f32, 2.0 + slope * (i % 4) as f32];
             (0..12).flat_map(point).collect()
         };
         let (flat, turned) = (wall(0.0), wall(0.01 * 30.0_f32.to_radians().tan()));
