@@ -85,14 +85,11 @@ impl BenchConfig {
     /// The config of the evaluation of a variant's pictures.
     pub(super) fn evaluation(&self, variant: &Variant) -> EvalConfig {
         let only = variant.only.as_ref().unwrap_or(&self.data.only).clone();
+        let (inputs, resolution) = (variant.inputs.clone().unwrap_or_default(), self.bench.resolution);
         let metrics = MetricsSection::default();
         EvalConfig {
             data: DataSection { subjects: self.bench.people, only, ..self.data.clone() },
-            views: ViewsSection {
-                inputs: variant.inputs.clone().unwrap_or_default(),
-                resolution: self.bench.resolution,
-                ..ViewsSection::default().of(variant)
-            },
+            views: ViewsSection { inputs, resolution, ..ViewsSection::default().of(variant) },
             metrics: MetricsSection { protocols: vec![Protocol::Masked], geometry: false, ..metrics },
             ..EvalConfig::default()
         }

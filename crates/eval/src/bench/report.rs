@@ -243,13 +243,8 @@ impl Bench<'_> {
         for (m, _) in plain() {
             series.push(Series { name: m.name.clone(), points: vec![at(m)], line: false });
         }
-        let axes = Axes {
-            caption: "Error against run time",
-            x: "a reconstruction and a view, p50, ms",
-            y: "PSNR, masked, dB",
-            log_x: true,
-            log_y: false,
-        };
+        let (x, y) = ("a reconstruction and a view, p50, ms", "PSNR, masked, dB");
+        let axes = Axes { caption: "Error against run time", x, y, log_x: true, log_y: false };
         svg(&[(axes, series)])
     }
 

@@ -101,14 +101,8 @@ pub struct ViewsSection {
 
 impl Default for ViewsSection {
     fn default() -> Self {
-        Self {
-            inputs: Vec::new(),
-            resolution: 0,
-            supersampling: 2,
-            compared: Vec::new(),
-            preset: Preset::Inria,
-            antialiased: false,
-        }
+        let (inputs, compared, preset) = (Vec::new(), Vec::new(), Preset::Inria);
+        Self { inputs, resolution: 0, supersampling: 2, compared, preset, antialiased: false }
     }
 }
 
@@ -171,13 +165,8 @@ pub struct MetricsSection {
 
 impl Default for MetricsSection {
     fn default() -> Self {
-        Self {
-            protocols: vec![Protocol::Paper, Protocol::Masked],
-            lpips: "weights".into(),
-            geometry: true,
-            mesh: false,
-            align: Align::None,
-        }
+        let protocols = vec![Protocol::Paper, Protocol::Masked];
+        Self { protocols, lpips: "weights".into(), geometry: true, mesh: false, align: Align::None }
     }
 }
 
