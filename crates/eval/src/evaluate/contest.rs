@@ -100,17 +100,12 @@ impl Contestant {
         canvas: usize,
         (metrics, truth): (&MetricsSection, Option<&Truth>),
     ) -> Result<Shown> {
-        let plain = |gaussians: Gaussians| match gaussians.is_empty() {
-            true => Err(no_gaussian()),
-            false => Ok(Shown {
-                gaussians,
-                points: Ok(PointErrors::default()),
-                lost: 0,
-                masks: None,
-                palette: None,
-                time: None,
-                aligned: None,
-            }),
+        let plain = |gaussians: Gaussians| {
+            if gaussians.is_empty() {
+                return Err(no_gaussian());
+            }
+            let points = Ok(PointErrors::default());
+            Ok(Shown { gaussians, points, lost: 0, masks: None, palette: None, time: None, aligned: None })
         };
         match self {
             Self::Model(.., model) => {

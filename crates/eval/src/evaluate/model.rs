@@ -147,15 +147,8 @@ impl Model {
         let motion = procrustes(from.as_chunks().0, onto.as_chunks().0, true);
         let (gaussians, _) = self.thinned(gaussians, &made.origins, false);
         let gaussians = gaussians.scaled(motion.scale).transformed(&motion.rigid());
-        Ok(Made {
-            gaussians,
-            maps: Vec::new(),
-            lost: made.lost,
-            masks: mean(&overlaps),
-            time,
-            modules: made.times,
-            steps: made.steps,
-        })
+        let (lost, modules, steps) = (made.lost, made.times, made.steps);
+        Ok(Made { gaussians, maps: Vec::new(), lost, masks: mean(&overlaps), time, modules, steps })
     }
 
     /// A person from photographs on their canvases, with known cameras. Placed photographs have `frames`.
