@@ -161,11 +161,8 @@ impl Surface {
         let surface = |[depth, alpha]: &[Vec<f32>; 2]| {
             depth.iter().zip(alpha).map(|(z, a)| if *a > 0.5 { z / a } else { 0.0 }).collect()
         };
-        Ok(Self {
-            chamfer: chamfer(&centres, &truth.points)?,
-            normals: truth.agreement(|i| surface(&drawn[i])),
-            open: truth.open(&drawn),
-        })
+        let normals = truth.agreement(|i| surface(&drawn[i]));
+        Ok(Self { chamfer: chamfer(&centres, &truth.points)?, normals, open: truth.open(&drawn) })
     }
 
     /// Compares the mesh of Gaussians (world frame) with the truth: points drawn from the mesh, and its depth maps.
@@ -176,11 +173,8 @@ impl Surface {
         let fused = fuse(&gaussians.clone().into(), Options::default(), &|_| {});
         let mesh = fused.map_err(EvalError::new)?.mesh;
         let drawn = sampled(&mesh, MOST, SEED)?;
-        Ok(Self {
-            chamfer: chamfer(&drawn, &truth.points)?,
-            normals: truth.agreement_of_mesh(&mesh)?,
-            open: None,
-        })
+        let normals = truth.agreement_of_mesh(&mesh)?;
+        Ok(Self { chamfer: chamfer(&drawn, &truth.points)?, normals, open: None })
     }
 }
 
