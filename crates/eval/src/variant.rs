@@ -77,14 +77,12 @@ impl Variant {
     pub(crate) fn refusal(&self) -> Option<(&'static str, String)> {
         let photographs = self.photographs.as_ref().and_then(PhotographChanges::problem);
         let must = |is_wrong: bool, range: &str| is_wrong.then(|| format!("must be {range}"));
+        let is_other = self.supersampling.is_some_and(|n| !SUPERSAMPLING.contains(&n));
         let problems = [
             ("photographs", photographs.map(|(key, message)| format!("`{key}` {message}"))),
             ("inputs", self.inputs.as_deref().and_then(views_problem)),
             ("stride", must(self.stride.is_some_and(|n| !(1..=64).contains(&n)), "1 to 64")),
-            (
-                "supersampling",
-                must(self.supersampling.is_some_and(|n| !SUPERSAMPLING.contains(&n)), "1, 2 or 4"),
-            ),
+            ("supersampling", must(is_other, "1, 2 or 4")),
             ("min_opacity", must(self.min_opacity.is_some_and(|o| !(0.0..=1.0).contains(&o)), "0 to 1")),
         ];
         problems.into_iter().find_map(|(key, problem)| Some((key, problem?)))

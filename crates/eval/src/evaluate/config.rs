@@ -232,20 +232,14 @@ impl EvalConfig {
         if let Some(problem) = views_problem(&views.inputs) {
             return Some(("views.inputs", problem));
         }
+        let is_empty = metrics.protocols.is_empty();
+        let has_many = report.people > 5 || report.degrees.len() > 12;
         let problems = [
             ("views.compared", names_twice(&views.compared), "names a view twice"),
             ("views.supersampling", !SUPERSAMPLING.contains(&views.supersampling), "must be 1, 2 or 4"),
-            (
-                "metrics.protocols",
-                metrics.protocols.is_empty(),
-                "is empty, must name `paper`, `masked` or both",
-            ),
+            ("metrics.protocols", is_empty, "is empty, must name `paper`, `masked` or both"),
             ("metrics.protocols", names_twice(&metrics.protocols), "names a protocol twice"),
-            (
-                "report.people",
-                report.people > 5 || report.degrees.len() > 12,
-                "at most 5 people of each kind and 12 views of each",
-            ),
+            ("report.people", has_many, "at most 5 people of each kind and 12 views of each"),
             ("report.degrees", report.degrees.iter().any(|d| !d.is_finite()), "must be numbers"),
         ];
         problems.into_iter().find_map(|(key, is_wrong, message)| is_wrong.then(|| (key, message.into())))
