@@ -35,9 +35,8 @@ pub fn cases() -> Vec<Case> {
     }
     let holds = "attributes finite and in range, gradient finite";
     cases.push(Case::new(AREA, "the regressor's 14 channels at ±1e4", holds, [0.0; 2], attributes));
-    for (size, name) in
-        [(1.0_f32, "identical tokens"), (1e4, "identical tokens of 1e4"), (1e18, "tokens of 1e18")]
-    {
+    let tokens = [(1.0_f32, "identical tokens"), (1e4, "identical tokens of 1e4"), (1e18, "tokens of 1e18")];
+    for (size, name) in tokens {
         let input = format!("attention with {name}");
         let holds = "the mean of equal values, relative; finite, gradient finite";
         cases.push(Case::new(AREA, input, holds, [1e-5, 0.0], move |device| attention(size, device)));

@@ -61,11 +61,8 @@ pub fn cases() -> Vec<Case> {
             let before = row[3..7].iter().map(|q| q * q).sum::<f32>().sqrt();
             row[3..7].iter_mut().for_each(|q| *q *= norm / before);
         });
-        let holds = if QUATERNIONS.contains(&norm.abs()) {
-            equal
-        } else {
-            "left out (below 1e-6 it is no rotation, beyond 1e18 no number), gradient 0; the others as the oracle without it"
-        };
+        let left_out = "left out (below 1e-6 it is no rotation, beyond 1e18 no number), gradient 0; the others as the oracle without it";
+        let holds = if QUATERNIONS.contains(&norm.abs()) { equal } else { left_out };
         add(format!("quaternion of norm {name}"), holds, rows, camera);
     }
     for (name, z) in [
@@ -213,11 +210,8 @@ fn against_oracle(rows: &[Row], camera: &Camera, device: &Device) -> Result<Foun
     };
     let gradient = found.as_chunks().0.iter().enumerate().map(of_row).fold(0.0, f64::max);
     let share = banded.iter().filter(|b| **b).count();
-    let note = if share > 0 {
-        format!("{share} of {} pixels lie at a cut-off and are not compared", banded.len())
-    } else {
-        String::new()
-    };
+    let note = format!("{share} of {} pixels lie at a cut-off and are not compared", banded.len());
+    let note = if share > 0 { note } else { String::new() };
     Ok(Found { value: Some(value), gradient: Some(gradient), note, ..Found::default() }
         .must(share < banded.len(), "nothing could be compared"))
 }
