@@ -219,30 +219,28 @@ impl EvalConfig {
         /// Names that have another meaning in reports.
         const TAKEN: [&str; 4] = ["model", "against", "billboard", "true_points"];
         let Self { views, metrics, report, ablations, .. } = self;
-        if let Some(name) = ablations.keys().find(|name| TAKEN.contains(&name.as_str())) {
-            let message = format!("`{name}` has another meaning in reports: choose another name");
-            return Some(("ablations", message));
-        }
-        if ablations.keys().any(|name| name.contains(char::is_control)) {
-            return Some(("ablations", "the name of an ablation has control characters".into()));
-        }
-        if let Some((key, message)) = self.photographs.problem() {
-            return Some(("photographs", format!("`{key}` {message}")));
-        }
-        if let Some(problem) = views_problem(&views.inputs) {
-            return Some(("views.inputs", problem));
-        }
+        let when = |is_wrong: bool, message: &str| is_wrong.then(|| message.to_owned());
+        let taken = ablations.keys().find(|name| TAKEN.contains(&name.as_str()));
+        let taken = taken.map(|name| format!("`{name}` has another meaning in reports: choose another name"));
+        let has_control = ablations.keys().any(|name| name.contains(char::is_control));
+        let photographs = self.photographs.problem().map(|(key, message)| format!("`{key}` {message}"));
+        let is_other = !SUPERSAMPLING.contains(&views.supersampling);
         let is_empty = metrics.protocols.is_empty();
         let has_many = report.people > 5 || report.degrees.len() > 12;
+        let is_endless = report.degrees.iter().any(|d| !d.is_finite());
         let problems = [
-            ("views.compared", names_twice(&views.compared), "names a view twice"),
-            ("views.supersampling", !SUPERSAMPLING.contains(&views.supersampling), "must be 1, 2 or 4"),
-            ("metrics.protocols", is_empty, "is empty, must name `paper`, `masked` or both"),
-            ("metrics.protocols", names_twice(&metrics.protocols), "names a protocol twice"),
-            ("report.people", has_many, "at most 5 people of each kind and 12 views of each"),
-            ("report.degrees", report.degrees.iter().any(|d| !d.is_finite()), "must be numbers"),
+            ("ablations", taken),
+            ("ablations", when(has_control, "the name of an ablation has control characters")),
+            ("photographs", photographs),
+            ("views.inputs", views_problem(&views.inputs)),
+            ("views.compared", when(names_twice(&views.compared), "names a view twice")),
+            ("views.supersampling", when(is_other, "must be 1, 2 or 4")),
+            ("metrics.protocols", when(is_empty, "is empty, must name `paper`, `masked` or both")),
+            ("metrics.protocols", when(names_twice(&metrics.protocols), "names a protocol twice")),
+            ("report.people", when(has_many, "at most 5 people of each kind and 12 views of each")),
+            ("report.degrees", when(is_endless, "must be numbers")),
         ];
-        problems.into_iter().find_map(|(key, is_wrong, message)| is_wrong.then(|| (key, message.into())))
+        problems.into_iter().find_map(|(key, problem)| Some((key, problem?)))
     }
 }
 
