@@ -114,12 +114,8 @@ pub fn evaluate(
     sides.dedup();
     let pictures =
         format!("pictures of {} pixels, rendered at {}×", sides.join(" and "), config.views.supersampling);
-    let named = |contestant: &Contestant| Judged {
-        name: contestant.name().to_owned(),
-        kind: contestant.kind(),
-        ..Judged::default()
-    };
-    let judged = contestants.iter().map(named).collect();
+    let named = |name: &str, kind| Judged { name: name.to_owned(), kind, ..Judged::default() };
+    let judged = contestants.iter().map(|c| named(c.name(), c.kind())).collect();
     let mut outcome = Outcome { people: Vec::new(), judged, left_out: Vec::new(), pictures };
     for (person, (people, row)) in everybody(sets).enumerate() {
         outcome.people.push(name_of(sets, people, row));
