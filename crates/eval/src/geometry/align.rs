@@ -30,11 +30,8 @@ pub enum Align {
 impl Align {
     /// Name of the method in reports.
     pub fn description(self) -> &'static str {
-        match self {
-            Self::None => "none",
-            Self::Rigid => "rigid, by iterated closest points",
-            Self::Similarity => "rigid and scale, by iterated closest points",
-        }
+        ["none", "rigid, by iterated closest points", "rigid and scale, by iterated closest points"]
+            [self as usize]
     }
 }
 
