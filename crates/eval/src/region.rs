@@ -118,7 +118,6 @@ mod tests {
         // Scaled by the height; never larger than the picture.
         let small = Region::paper(&picture([256, 100], &[[50, 128]])).expect("a person");
         assert_eq!(small.window, [0, 3, 100, 250]);
-        assert!(Region::paper(&picture([8, 8], &[])).is_err());
     }
 
     #[test]
@@ -130,6 +129,5 @@ mod tests {
         assert_eq!((region.window, region.pixels()), ([5, 3, 5, 5], 25));
         let head = region.head();
         assert_eq!((head.window, head.pixels()), ([5, 3, 5, 1], 5));
-        assert!(Region::masked(&[0.0; 200], [10, 20], 2).is_err());
     }
 }

@@ -46,8 +46,7 @@ pub fn side_points(
         let there = points.as_chunks().0.iter().zip(valid).filter(|(_, valid)| *valid > 0.5);
         seen.extend(there.map(|(point, _)| to_world.apply(double(*point))));
     }
-    let canvas = u32::try_from(side).expect("the side of a canvas");
-    let nearest = visible(&seen, &front.turned(azimuth).resized(canvas, canvas));
+    let nearest = visible(&seen, &front.turned(azimuth).resized(side as u32, side as u32));
     let valid = nearest.iter().map(|point| f32::from(u8::from(point.is_some()))).collect();
     let in_front = |i: usize| front.world_to_camera.apply(seen[i]).as_vec3().to_array();
     Ok((nearest.into_iter().flat_map(|point| point.map_or([0.0; 3], in_front)).collect(), valid))
