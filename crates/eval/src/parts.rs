@@ -114,7 +114,7 @@ mod tests {
         let found = part_errors(&pair, &joints, side);
         let [head, hand] = found[..] else { panic!("{found:?}") };
         assert_eq!((head.part, hand.part), (0, 1));
-        let is_near = |found: Option<f64>, at: f64, most| found.is_some_and(|v| (v - at).abs() < most);
+        let is_near = |found: Option<f64>, at: f64, most: f64| found.is_some_and(|v| (v - at).abs() < most);
         assert!(is_near(head.relief, 0.004, 2e-4) && head.far == 0.0, "{head:?}");
         // Slopes of 8 mm over 2 mm.
         let slope = 4.0_f64.atan().to_degrees();
