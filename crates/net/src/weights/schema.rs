@@ -86,11 +86,6 @@ impl Schema for Config {
     }
 }
 
-/// Number of parameters of one part.
-pub fn parameters(config: &Config, part: Part) -> usize {
-    tensors(config).iter().filter(|t| t.part == part).map(TensorSpec::elements).sum()
-}
-
 fn list<M: Module>(module: &M, prefix: &str, part: Part) -> Vec<TensorSpec> {
     let mut list = List { tensors: Vec::new(), part, bound: 0.0 };
     visit_named(module, prefix, &mut list);
@@ -132,20 +127,6 @@ impl NamedVisitor for List {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::HeadKind;
-
-    /// The counts of docs/method.md, "Weight files".
-    #[test]
-    fn the_default_config_has_the_published_number_of_parameters() {
-        let mut config = Config::default();
-        assert_eq!(parameters(&config, Part::PointPredictor), 611_573_777);
-        assert_eq!(parameters(&config, Part::Regressor), 117_966 + 210);
-        config.network.side_heads = false;
-        // DUSt3R's own count has a mask token of 768 and no δ.
-        assert_eq!(parameters(&config, Part::PointPredictor), 571_171_208 - 768 + 1);
-        config.network.head = HeadKind::Linear;
-        assert_eq!(parameters(&config, Part::PointPredictor), 532_342_784 - 768 + 1);
-    }
 
     #[test]
     fn layers_start_as_the_published_code_starts_them() {
