@@ -18,11 +18,8 @@ pub fn shrink(x: Tensor<4>, factor: usize, method: Downsample) -> Tensor<4> {
         Downsample::Nearest => {
             let [b, c, h, w] = x.dims();
             let (h, w) = (h / factor, w / factor);
-            x.reshape([b * c, h, factor, w * factor])
-                .narrow(2, 0, 1)
-                .reshape([b * c, h, w, factor])
-                .narrow(3, 0, 1)
-                .reshape([b, c, h, w])
+            let cells = x.reshape([b, c, h, factor, w, factor]);
+            cells.narrow(3, 0, 1).narrow(5, 0, 1).reshape([b, c, h, w])
         }
     }
 }
