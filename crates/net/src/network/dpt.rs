@@ -44,26 +44,15 @@ impl Enlarge {
     }
 }
 
-/// 1×1 convolution only.
-#[derive(Module, Debug)]
-struct Keep {
-    at_0: Conv2d,
-}
-
-/// 1×1 convolution, then a 3×3 convolution with stride 2.
-#[derive(Module, Debug)]
-struct Reduce {
-    at_0: Conv2d,
-    at_1: Conv2d,
-}
-
 /// The four branches that bring the token maps to 4, 2, 1 and ½ times the token grid.
 #[derive(Module, Debug)]
 struct Branches {
     at_0: Enlarge,
     at_1: Enlarge,
-    at_2: Keep,
-    at_3: Reduce,
+    /// 1×1 convolution only.
+    at_2: Vec<Conv2d>,
+    /// 1×1 convolution, then a 3×3 convolution with stride 2.
+    at_3: Vec<Conv2d>,
 }
 
 /// x + conv₂(relu(conv₁(relu x))).
@@ -157,8 +146,8 @@ impl DptHead {
             act_postprocess: Branches {
                 at_0: Enlarge::new(widths[0], d0, 4, device),
                 at_1: Enlarge::new(widths[1], d1, 2, device),
-                at_2: Keep { at_0: conv1x1(widths[2], d2, device) },
-                at_3: Reduce { at_0: conv1x1(widths[3], d3, device), at_1: conv3x3(d3, d3, 2, true, device) },
+                at_2: vec![conv1x1(widths[2], d2, device)],
+                at_3: vec![conv1x1(widths[3], d3, device), conv3x3(d3, d3, 2, true, device)],
             },
             scratch: Scratch {
                 layer1_rn: conv3x3(d0, f, 1, false, device),
@@ -188,9 +177,9 @@ impl DptHead {
         });
         let (branches, s) = (&self.act_postprocess, &self.scratch);
         let conv = |layer: &Conv2d, x| conv2d(layer, x, false);
-        let l3 = conv(&branches.at_3.at_1, conv(&branches.at_3.at_0, m3));
+        let l3 = conv(&branches.at_3[1], conv(&branches.at_3[0], m3));
         let path = s.refinenet4.forward(conv(&s.layer4_rn, l3), None);
-        let l2 = conv(&s.layer3_rn, conv(&branches.at_2.at_0, m2));
+        let l2 = conv(&s.layer3_rn, conv(&branches.at_2[0], m2));
         let path = s.refinenet3.forward(path, Some(l2));
         let path = s.refinenet2.forward(path, Some(conv(&s.layer2_rn, branches.at_1.forward(m1))));
         let path = s.refinenet1.forward(path, Some(conv(&s.layer1_rn, branches.at_0.forward(m0))));
