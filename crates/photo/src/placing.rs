@@ -36,11 +36,6 @@ impl Mapping {
         Self { scale, origin: DVec2::new(left as f64, top as f64) - size(person.x, person.y) * scale }
     }
 
-    /// The place on the canvas of a place on the photograph.
-    pub fn canvas(&self, source: DVec2) -> DVec2 {
-        source * self.scale + self.origin
-    }
-
     /// The place on the photograph of a place on the canvas.
     pub fn source(&self, canvas: DVec2) -> DVec2 {
         (canvas - self.origin) / self.scale

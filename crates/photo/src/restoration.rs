@@ -166,7 +166,7 @@ mod tests {
         let moved = map.apply(point).expect("in front");
         let [before, after] =
             [(&from, point), (&to, moved)].map(|(camera, p)| camera.project(p).expect("in front").0);
-        assert!(pixels.canvas(before).abs_diff_eq(after, 1e-9), "{before} {after}");
+        assert!(pixels.source(after).abs_diff_eq(before, 1e-9), "{before} {after}");
         assert!((moved.z - 1.2 * point.z).abs() < 1e-12);
         let all = Tensor::from_floats([point, behind].map(|p| p.as_vec3().to_array()), &Device::flex());
         let all = map.apply_all(&all).into_data().try_to_vec::<f32>().expect("f32");
