@@ -95,7 +95,17 @@ pub fn matte(
         let scale = size[0] as f32 / part.height as f32 / look.scale();
         probability = combined(&probability, &look.probabilities(part, size), size[1], scale);
     }
-    Filter::new(&person, &probability, size).cut_out(&picture, &mut mask, part);
+    let (slope, offset) = filters(&person, &probability, size);
+    let down = taps(size[0], part.height as usize, false);
+    let across = taps(size[1], part.width as usize, false);
+    for (y, down) in (part.y..).zip(&down) {
+        for (x, across) in (part.x..).zip(&across) {
+            let at = [*down, *across];
+            let color = unit_color(picture.get_pixel(x, y));
+            let share = interpolate(&slope, size[1], at).dot(color) + interpolate(&offset, size[1], at);
+            mask.put_pixel(x, y, Luma([(255.0 * between(share, SOFT)).round() as u8]));
+        }
+    }
     if let Some(strokes) = strokes {
         paint(strokes, &mut mask);
     }
@@ -172,84 +182,54 @@ fn filtered_size(part: Rect) -> [usize; 2] {
     [scaled(part.height), scaled(part.width)]
 }
 
-/// The filters of a small picture, which are interpolated at full resolution.
-struct Filter {
-    size: [usize; 2],
-    /// Coverage = `slope` · colour + `offset`.
-    slope: Vec<Vec3>,
-    offset: Vec<f32>,
-}
+/// The filters of a picture and its probabilities `p` at `size` (rows, columns), which are interpolated at full
+/// resolution. Coverage = slope · colour + offset.
+fn filters(rgb: &RgbImage, p: &[f32], [rows, columns]: [usize; 2]) -> (Vec<Vec3>, Vec<f32>) {
+    let small = imageops::resize(rgb, columns as u32, rows as u32, FilterType::Triangle);
+    let color: Vec<Vec3> = small.pixels().map(unit_color).collect();
 
-impl Filter {
-    /// `p`: probabilities at `size` (rows, columns).
-    fn new(rgb: &RgbImage, p: &[f32], size: [usize; 2]) -> Self {
-        let wide = size[1];
-        let small = imageops::resize(rgb, wide as u32, size[0] as u32, FilterType::Triangle);
-        let color: Vec<Vec3> = small.pixels().map(unit_color).collect();
-
-        let mean = |of: &dyn Fn(usize) -> f32| means(&(0..p.len()).map(of).collect::<Vec<_>>(), wide, RADIUS);
-        let mean_of_color: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| color[i][c]));
-        let products = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)];
-        let products = products.map(|(a, b)| mean(&|i| color[i][a] * color[i][b]));
-        let at = |planes: &[Vec<f32>; 3], i: usize| Vec3::from_array(std::array::from_fn(|c| planes[c][i]));
-        // In f64: the three colours of a grey edge are nearly one.
-        let inverse = |i: usize| {
-            let m = at(&mean_of_color, i);
-            let [rr, rg, rb, gg, gb, bb] = std::array::from_fn(|k| products[k][i]);
-            let covariance = Mat3::from_cols(
-                Vec3::new(rr + EPSILON, rg, rb) - m * m.x,
-                Vec3::new(rg, gg + EPSILON, gb) - m * m.y,
-                Vec3::new(rb, gb, bb + EPSILON) - m * m.z,
-            );
-            covariance.as_dmat3().inverse()
+    let mean = |of: &dyn Fn(usize) -> f32| means(&(0..p.len()).map(of).collect::<Vec<_>>(), columns, RADIUS);
+    let mean_colors = |of: &dyn Fn(usize) -> Vec3| -> Vec<Vec3> {
+        let planes: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| of(i)[c]));
+        (0..p.len()).map(|i| Vec3::from_array(std::array::from_fn(|c| planes[c][i]))).collect()
+    };
+    let mean_color = mean_colors(&|i| color[i]);
+    let products = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)];
+    let products = products.map(|(a, b)| mean(&|i| color[i][a] * color[i][b]));
+    // In f64: the three colours of a grey edge are nearly one.
+    let inverse = |i: usize| {
+        let m = mean_color[i];
+        let [rr, rg, rb, gg, gb, bb] = std::array::from_fn(|k| products[k][i]);
+        let covariance = Mat3::from_cols(
+            Vec3::new(rr + EPSILON, rg, rb) - m * m.x,
+            Vec3::new(rg, gg + EPSILON, gb) - m * m.y,
+            Vec3::new(rb, gb, bb + EPSILON) - m * m.z,
+        );
+        covariance.as_dmat3().inverse()
+    };
+    let inverses: Vec<DMat3> = (0..p.len()).map(inverse).collect();
+    let fitted = |p: &[f32]| {
+        let mean_of_p = mean(&|i| p[i]);
+        let mean_of_both = mean_colors(&|i| color[i] * p[i]);
+        let line = |i: usize| {
+            let m = mean_color[i];
+            let slope = (inverses[i] * (mean_of_both[i] - m * mean_of_p[i]).as_dvec3()).as_vec3();
+            (slope, mean_of_p[i] - slope.dot(m))
         };
-        let inverses: Vec<DMat3> = (0..p.len()).map(inverse).collect();
-        let fitted = |p: &[f32]| {
-            let mean_of_p = mean(&|i| p[i]);
-            let mean_of_both: [Vec<f32>; 3] = std::array::from_fn(|c| mean(&|i| color[i][c] * p[i]));
-            let line = |i: usize| {
-                let m = at(&mean_of_color, i);
-                let slope = (inverses[i] * (at(&mean_of_both, i) - m * mean_of_p[i]).as_dvec3()).as_vec3();
-                (slope, mean_of_p[i] - slope.dot(m))
-            };
-            let (slope, offset): (Vec<Vec3>, Vec<f32>) = (0..p.len()).map(line).unzip();
-            (mean_colors(&slope, wide), means(&offset, wide, RADIUS))
-        };
-        let (mut slope, mut offset) = fitted(p);
-        for _ in 1..FILTERS {
-            let share = |i: usize| between(slope[i].dot(color[i]) + offset[i], SOFT);
-            (slope, offset) = fitted(&(0..p.len()).map(share).collect::<Vec<_>>());
-        }
-        Self { size, slope, offset }
+        let (slope, offset): (Vec<Vec3>, Vec<f32>) = (0..p.len()).map(line).unzip();
+        (mean_colors(&|i| slope[i]), mean(&|i| offset[i]))
+    };
+    let (mut slope, mut offset) = fitted(p);
+    for _ in 1..FILTERS {
+        let share = |i: usize| between(slope[i].dot(color[i]) + offset[i], SOFT);
+        (slope, offset) = fitted(&(0..p.len()).map(share).collect::<Vec<_>>());
     }
-
-    /// Writes the coverage into the part of the mask for which the filter was made.
-    fn cut_out(&self, picture: &RgbImage, mask: &mut GrayImage, part: Rect) {
-        let [rows, columns] = self.size;
-        let across = taps(columns, part.width as usize, false);
-        let down = taps(rows, part.height as usize, false);
-        for (y, down) in (part.y..).zip(&down) {
-            for (x, across) in (part.x..).zip(&across) {
-                let at = [*down, *across];
-                let color = unit_color(picture.get_pixel(x, y));
-                let share =
-                    interpolate(&self.slope, columns, at).dot(color) + interpolate(&self.offset, columns, at);
-                mask.put_pixel(x, y, Luma([(255.0 * between(share, SOFT)).round() as u8]));
-            }
-        }
-    }
+    (slope, offset)
 }
 
 /// The share of the way from the first limit to the second.
 fn between(alpha: f32, (low, high): (f32, f32)) -> f32 {
     ((alpha - low) / (high - low)).clamp(0.0, 1.0)
-}
-
-fn mean_colors(values: &[Vec3], width: usize) -> Vec<Vec3> {
-    let planes: [Vec<f32>; 3] = std::array::from_fn(|c| {
-        means(&values.iter().map(|value| value[c]).collect::<Vec<_>>(), width, RADIUS)
-    });
-    (0..values.len()).map(|i| Vec3::new(planes[0][i], planes[1][i], planes[2][i])).collect()
 }
 
 /// Means over the squares of pixels within `radius`, as far as they are in the picture.
