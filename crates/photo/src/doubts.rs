@@ -1,7 +1,7 @@
 //! Signs that two photographs do not show the front and the back of one person who stands upright.
 
 use glam::Vec2;
-use image::{GrayImage, RgbImage};
+use image::GrayImage;
 use serde::Serialize;
 
 use super::INSIDE;
@@ -259,8 +259,8 @@ fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
     let (mut sum, mut count) = (0.0, 0);
     for (x, y) in (0..GRID).flat_map(|y| (0..GRID).map(move |x| (x, y))) {
         let [a, b] = [(front, false), (back, mirrored)].map(|(one, mirrored)| {
-            let at = place(one.report.person, x, y, mirrored);
-            (color(&one.rgb, at), one.mask.get_pixel(at.0, at.1)[0] >= INSIDE)
+            let (x, y) = place(one.report.person, x, y, mirrored);
+            (one.rgb.get_pixel(x, y).0.map(f32::from), one.mask.get_pixel(x, y)[0] >= INSIDE)
         });
         if a.1 || b.1 {
             sum += a.0.iter().zip(b.0).map(|(a, b)| (a - b).abs()).sum::<f32>() / 3.0;
@@ -268,8 +268,4 @@ fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
         }
     }
     count > 0 && sum / count as f32 <= EQUAL
-}
-
-fn color(picture: &RgbImage, (x, y): (u32, u32)) -> [f32; 3] {
-    picture.get_pixel(x, y).0.map(f32::from)
 }
