@@ -20,14 +20,6 @@ pub fn nominal(photograph: usize, side: u32) -> Camera {
     Camera::orbit_at_yaw_degrees([0.0, 180.0][photograph], side)
 }
 
-/// Scale of the points of `camera` over the points of a nominal camera: the ratio of the distances from the body's
-/// axis times the ratio of the pixel sizes. `mapping` maps the photograph to a canvas of `side` pixels.
-fn scale_of(mapping: &Mapping, camera: &Camera, side: u32) -> f64 {
-    let nominal = Orbit::default();
-    let distance = camera.world_to_camera.apply(nominal.centre).z / nominal.radius;
-    distance * nominal.focal * f64::from(side) / camera.focal.y / mapping.scale.y
-}
-
 /// Least distance in metres in front of the first camera and, along z, from the second. Nearer points do not move.
 const NEAREST: f64 = 1e-3;
 
@@ -95,7 +87,10 @@ impl Restoration {
     /// For known cameras of front and back, whose pixels `mappings` map to canvases of `side` pixels.
     pub fn to_cameras(cameras: [&Camera; 2], mappings: [&Mapping; 2], side: u32) -> Self {
         let turn = turn_to_front(cameras[0]);
-        let scale = scale_of(mappings[0], cameras[0], side);
+        // The ratio of the distances from the body's axis times the ratio of the pixel sizes.
+        let Orbit { centre, radius, focal, .. } = Orbit::default();
+        let distance = cameras[0].world_to_camera.apply(centre).z / radius;
+        let scale = distance * focal * f64::from(side) / cameras[0].focal.y / mappings[0].scale.y;
         let map = |i: usize| {
             PlaneMap::new(&nominal(i, side), &turned(cameras[i], &turn), &mappings[i].inverse(), scale)
         };
