@@ -41,11 +41,7 @@ impl Shot {
             Content::Bytes(bytes) => reader.read_from_container(&mut Cursor::new(bytes)).ok(),
             Content::Pixels(..) => None,
         };
-        let found = guarded(source.path, || Ok(read()));
-        found.ok().flatten().map_or(Self::default(), |found| Self::in_exif(&found))
-    }
-
-    fn in_exif(exif: &exif::Exif) -> Self {
+        let Ok(Some(exif)) = guarded(source.path, || Ok(read())) else { return Self::default() };
         let field = |tag| exif.get_field(tag, In::PRIMARY).map(|field| &field.value);
         let focal = field(Tag::FocalLengthIn35mmFilm).and_then(|value| value.get_uint(0));
         // The camera beside the screen looks the other way, so the pitch would be wrong.
