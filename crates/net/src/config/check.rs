@@ -3,8 +3,8 @@
 use snapsnap_base::config::outside;
 
 use super::{
-    Anchor, Body, CELL, COLOR_LIMITS, Config, Downsample, HULL_REACH, HeadKind, LEAST_OPACITIES, OPPOSITE,
-    PATCH, RegressorStart, RotationFrame, Sides, Upsample, WorldFrame,
+    Anchor, Body, CELL, COLOR_LIMITS, Config, Downsample, HULL_REACH, HeadKind, LEAST_OPACITIES,
+    NetworkConfig, OPPOSITE, PATCH, RegressorStart, RotationFrame, Sides, Upsample, WorldFrame,
 };
 
 /// Largest number of parameters: seven times the published size, 16 GB of f32.
@@ -69,11 +69,13 @@ impl Config {
     /// The first refused combination. Each value must be in its range already.
     fn problem(&self) -> Option<Problem> {
         let (n, r) = (&self.network, &self.regressor);
+        let &NetworkConfig { patch, resolution, net_resolution: small, feature_dim, dec_depth, .. } = n;
         let is_transformer = n.body == Body::Transformer;
         let is_completed = n.sides == Sides::Completed;
+        let is_ray = n.anchor == Anchor::Ray;
         let is_oblique = n.pair_degrees != OPPOSITE;
         let is_geometric = r.start() == RegressorStart::Geometric;
-        let hook = n.hooks.into_iter().find(|hook| *hook > n.dec_depth).unwrap_or(0);
+        let hook = n.hooks.into_iter().find(|hook| *hook > dec_depth).unwrap_or(0);
         let heads =
             [("network.enc_heads", n.enc_dim, n.enc_heads), ("network.dec_heads", n.dec_dim, n.dec_heads)];
         let heads = heads.map(|(key, dim, heads)| {
@@ -81,90 +83,68 @@ impl Config {
             (key, !dim.is_multiple_of(4 * heads), format!("{dim} channels over {heads} heads: {rule}"))
         });
         let completed = |needed: &str| format!("must be {needed} with `network.sides = \"completed\"`");
-        let opposite = |key: &str| format!("must be 180 with `network.{key} = true`");
+        let opposite = |other: &str| format!("must be 180 with `{other}`");
         let of_geometry = || "has no meaning where `regressor.start` is \"published\"".to_owned();
-        let is_patched = n.net_resolution.is_multiple_of(n.patch);
-        let is_enlarged = n.resolution.is_multiple_of(n.net_resolution) && n.resolution.is_multiple_of(4);
+        let is_patched = small.is_multiple_of(patch);
+        let is_enlarged = resolution.is_multiple_of(small) && resolution.is_multiple_of(4);
         // Both halves of an image have a whole number of pixels at every level.
-        let is_halved = n.net_resolution.is_multiple_of(2 * n.patch);
+        let is_halved = small.is_multiple_of(2 * patch);
         // Details are left out of smaller canvases.
-        let details =
-            n.details.as_ref().map(|details| details.resolution).filter(|size| *size <= n.resolution);
+        let details = n.details.as_ref().map(|details| details.resolution).filter(|size| *size <= resolution);
         // Windows are whole patches of the predictor's input.
         let is_detailed = details.is_none_or(|size| {
-            size.is_multiple_of(PATCH * n.net_resolution)
-                && n.resolution.is_multiple_of(size)
-                && (n.patch * size / n.net_resolution).is_multiple_of(PATCH * CELL)
+            size.is_multiple_of(PATCH * small)
+                && resolution.is_multiple_of(size)
+                && (patch * size / small).is_multiple_of(PATCH * CELL)
         });
         let problems = [
-            (
-                "network.feature_dim",
-                !n.feature_dim.is_multiple_of(2),
-                format!("is {}, must be even", n.feature_dim),
-            ),
+            ("network.feature_dim", feature_dim % 2 == 1, format!("is {feature_dim}, must be even")),
             (
                 "network.hooks",
-                is_transformer && hook > n.dec_depth,
-                format!("{hook} is beyond the last layer {}", n.dec_depth),
+                is_transformer && hook > dec_depth,
+                format!("{hook} is beyond the last layer {dec_depth}"),
             ),
             (
                 "network.patch",
-                is_transformer && n.head == HeadKind::Dpt && n.patch != 16,
-                format!("is {}; the DPT head has patches of 16 pixels", n.patch),
+                is_transformer && n.head == HeadKind::Dpt && patch != 16,
+                format!("is {patch}; the DPT head has patches of 16 pixels"),
             ),
             (
                 "network.patch",
-                !is_transformer && ![8, 16].contains(&n.patch),
-                format!("is {}, must be 8 or 16 with `network.body = \"convolution\"`", n.patch),
+                !is_transformer && ![8, 16].contains(&patch),
+                format!("is {patch}, must be 8 or 16 with `network.body = \"convolution\"`"),
             ),
             ("network.body", is_completed && is_transformer, completed("\"convolution\"")),
-            ("network.anchor", is_completed && n.anchor != Anchor::Ray, completed("\"ray\"")),
+            ("network.anchor", is_completed && !is_ray, completed("\"ray\"")),
             ("network.mask_channel", is_completed && !n.mask_channel, completed("true")),
             ("network.mirror", is_completed && !n.mirror, completed("true")),
-            ("network.patch", is_completed && n.patch != 8, completed("8")),
+            ("network.patch", is_completed && patch != 8, completed("8")),
             ("network.net_resolution", is_completed && !is_halved, completed("a multiple of 16")),
             (
                 "network.second_layer",
                 n.second_layer && !(is_completed && n.side_heads),
                 "needs `network.sides = \"completed\"` and `network.side_heads = true`".into(),
             ),
-            (
-                "network.details",
-                n.details.is_some() && n.anchor != Anchor::Ray,
-                "needs `network.anchor = \"ray\"`".into(),
-            ),
-            (
-                "network.pair_degrees",
-                details.is_some() && is_oblique,
-                "must be 180 with `network.details`".into(),
-            ),
+            ("network.details", n.details.is_some() && !is_ray, "needs `network.anchor = \"ray\"`".into()),
+            ("network.pair_degrees", details.is_some() && is_oblique, opposite("network.details")),
             (
                 "network.details.resolution",
                 !is_detailed,
                 format!(
-                    "must be a multiple of twice `network.net_resolution` ({}) and divide `network.resolution` ({}); a \
-                     patch must have a multiple of {} of its pixels",
-                    n.net_resolution,
-                    n.resolution,
+                    "must be a multiple of twice `network.net_resolution` ({small}) and divide `network.resolution` \
+                     ({resolution}); a patch must have a multiple of {} of its pixels",
                     PATCH * CELL
                 ),
             ),
             // The mirror image of the second photograph belongs to a camera at minus this angle.
-            ("network.pair_degrees", is_oblique && n.side_heads, opposite("side_heads")),
-            ("network.pair_degrees", is_oblique && n.mirror, opposite("mirror")),
-            ("network.pair_degrees", is_oblique && n.both_ways, opposite("both_ways")),
-            (
-                "network.net_resolution",
-                !is_patched,
-                format!("{} is no multiple of the patch {}", n.net_resolution, n.patch),
-            ),
+            ("network.pair_degrees", is_oblique && n.side_heads, opposite("network.side_heads = true")),
+            ("network.pair_degrees", is_oblique && n.mirror, opposite("network.mirror = true")),
+            ("network.pair_degrees", is_oblique && n.both_ways, opposite("network.both_ways = true")),
+            ("network.net_resolution", !is_patched, format!("{small} is no multiple of the patch {patch}")),
             (
                 "network.resolution",
                 !is_enlarged,
-                format!(
-                    "is {}, must be a multiple of `network.net_resolution` ({}) and of 4",
-                    n.resolution, n.net_resolution
-                ),
+                format!("is {resolution}, must be a multiple of `network.net_resolution` ({small}) and of 4"),
             ),
             (
                 "network.closed_top",
