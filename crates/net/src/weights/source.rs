@@ -65,7 +65,10 @@ impl Source {
         if let Some((length, b"{")) = start.split_first_chunk() {
             let header = u64::from_le_bytes(*length);
             if (1..=MAX_HEADER).contains(&header) {
-                return Self::safetensors(path, file, header);
+                let size = file.metadata().map_err(&read)?.len();
+                let mut text = vec![b'{'; 1];
+                (&mut file).take(header - 1).read_to_end(&mut text).map_err(&read)?;
+                return Self::described(path, &text, size, Reader::Safetensors(file));
             }
         }
         if path.extension().is_some_and(|e| e == "safetensors") {
@@ -86,14 +89,6 @@ impl Source {
         let header = u64::from_le_bytes(*start);
         let text = &rest[..rest.len().min(usize::try_from(header).unwrap_or(usize::MAX))];
         Self::described(path, text, bytes.len() as u64, Reader::Embedded(bytes))
-    }
-
-    fn safetensors(path: &Path, mut file: File, header: u64) -> Result<Self, WeightsError> {
-        let read = FileError::read(path);
-        let size = file.metadata().map_err(&read)?.len();
-        let mut text = vec![b'{'; 1];
-        (&mut file).take(header - 1).read_to_end(&mut text).map_err(&read)?;
-        Self::described(path, &text, size, Reader::Safetensors(file))
     }
 
     /// A safetensors file of `size` bytes with this header.
