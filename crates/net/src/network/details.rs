@@ -52,12 +52,6 @@ impl Details {
         };
         Self { body: UNet::new(&sizes, device), resolution: config.resolution }
     }
-
-    /// Movements along the rays `[N, 1, PATCH·h, PATCH·w]`, in network units.
-    pub(super) fn relief(&self, images: Tensor<4>) -> Tensor<4> {
-        let levels = self.body.encode(images, None);
-        joined(self.body.decoder.out(self.body.features(&levels))) * UNIT
-    }
 }
 
 /// The pixels of each patch as channels: `[B, C, h, w]` → `[B, C·PATCH², h/PATCH, w/PATCH]`.
@@ -192,7 +186,8 @@ impl PointPredictor {
     /// # Panics
     /// Without a network of details.
     pub fn relief(&self, images: Tensor<4>) -> Tensor<4> {
-        self.details.as_ref().expect("a network of details").relief(images)
+        let body = &self.details.as_ref().expect("a network of details").body;
+        joined(body.decoder.out(body.features(&body.encode(images, None)))) * UNIT
     }
 }
 
