@@ -166,10 +166,6 @@ pub(super) fn normalise_with(norm: &GroupNorm, x: Tensor<4>, [mean, rstd]: [Tens
 /// Nearest-neighbour ×2 enlargement of `[B, C, H, W]`.
 fn repeat_twice(x: Tensor<4>) -> Tensor<4> {
     let [b, c, h, w] = x.dims();
-    x.reshape([b * c, h, 1, w]).repeat_dim(2, 2).reshape([b * c, 2 * h, w, 1]).repeat_dim(3, 2).reshape([
-        b,
-        c,
-        2 * h,
-        2 * w,
-    ])
+    let rows = x.reshape([b * c, h, 1, w]).repeat_dim(2, 2);
+    rows.reshape([b * c, 2 * h, w, 1]).repeat_dim(3, 2).reshape([b, c, 2 * h, 2 * w])
 }
