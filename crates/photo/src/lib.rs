@@ -118,14 +118,10 @@ pub fn read(
         _ => None,
     };
     let mut standing = common(&cutouts);
-    let mut unturned = vec![None; cutouts.len()];
-    if is_placed {
-        for (cutout, before) in cutouts.iter_mut().zip(&mut unturned) {
-            *before = cutout.turn(standing);
-        }
-        if unturned.iter().any(Option::is_some) {
-            standing = common(&cutouts);
-        }
+    let turn = |cutout: &mut Cutout| is_placed.then(|| cutout.turn(standing)).flatten();
+    let unturned: Vec<_> = cutouts.iter_mut().map(turn).collect();
+    if unturned.iter().any(Option::is_some) {
+        standing = common(&cutouts);
     }
     let mut made = Photographs { doubts, ..Photographs::default() };
     for (mut cutout, before) in cutouts.into_iter().zip(unturned) {
