@@ -13,7 +13,7 @@ use crate::closed_top::Top;
 use crate::config::{Config, RegressorConfig, RegressorStart};
 use crate::nearest_colors::EMPTY;
 pub use crate::nearest_colors::side_images;
-use crate::network::{View, nominal_camera};
+use crate::network::View;
 use crate::photograph::Photograph;
 use crate::points::Points;
 use crate::reconstruct::rows;
@@ -101,14 +101,10 @@ impl Painter<'_> {
             parts.extend(record.timed("closed top", |record| {
                 let top =
                     Top::new(colors, [canvases[0].points, canvases[1].points], [&valid[0], &valid[1]], side)?;
-                record.steps.push(Step::ClosedTop { gaussians: count(&top.valid) });
-                let seen = CanvasView {
-                    view: View::Front,
-                    image: &top.image,
-                    points: &top.points,
-                    valid: &top.valid,
-                };
-                let part = uncorrected(&seen, config, Limits::of(&config.regressor, 0), side, device);
+                let Top { image, points, valid } = &top;
+                record.steps.push(Step::ClosedTop { gaussians: count(valid) });
+                let seen = CanvasView { view: View::Front, image, points, valid };
+                let part = uncorrected(&seen, config, side, device);
                 let origins = part.origins.iter().map(|origin| Origin { view: None, ..*origin }).collect();
                 Some(Part { origins, ..part })
             }));
@@ -169,11 +165,6 @@ impl CanvasView<'_> {
         let pixels = (0..self.valid.len()).filter(|pixel| self.valid[*pixel]);
         pixels.map(|pixel| Origin { view: Some(self.view), pixel: pixel as u32 }).collect()
     }
-
-    fn geometry(&self, config: &Config, side: usize, limits: Limits, device: &Device) -> Geometry {
-        let camera = nominal_camera(self.view, config.network.pair_degrees, side);
-        Geometry::new(self, &camera, limits, device)
-    }
 }
 
 /// Features of one view's N valid pixels.
@@ -226,7 +217,7 @@ fn regress(
             continue;
         }
         let pick = |x: Tensor<4>, c: usize| taken(x.narrow(0, i, 1).reshape([h * w, c]), &rows);
-        let geometry = is_geometric.then(|| view.geometry(config, side, limits, &device));
+        let geometry = is_geometric.then(|| Geometry::new(view, config, side, limits, &device));
         parts.push(Part {
             features: pick(features.clone(), FEATURES),
             points: pick(points.clone(), 3),
@@ -242,14 +233,14 @@ fn regress(
 /// neighbours (docs/method.md, "Geometric start").
 pub fn geometric(views: &[CanvasView], side: usize, device: &Device) -> Gaussians {
     let config = Config::default();
-    let limits = Limits::of(&config.regressor, 0);
     let parts = views.iter().filter(|view| view.valid.contains(&true));
-    let parts = parts.map(|view| uncorrected(view, &config, limits, side, device)).collect();
+    let parts = parts.map(|view| uncorrected(view, &config, side, device)).collect();
     assemble(parts, device).0
 }
 
-/// The part of a view without corrections by a regressor.
-fn uncorrected(view: &CanvasView, config: &Config, limits: Limits, side: usize, device: &Device) -> Part {
+/// The part of a view without corrections by a regressor, with the limits of photographs.
+fn uncorrected(view: &CanvasView, config: &Config, side: usize, device: &Device) -> Part {
+    let limits = Limits::of(&config.regressor, 0);
     let origins = view.origins();
     let n = origins.len();
     let points = origins.iter().flat_map(|origin| &view.points[3 * origin.pixel as usize..][..3]);
@@ -257,7 +248,7 @@ fn uncorrected(view: &CanvasView, config: &Config, limits: Limits, side: usize, 
     Part {
         features: Tensor::zeros([n, FEATURES], device),
         points: Tensor::from_data(TensorData::new(points, [n, 3]), device),
-        geometry: Some(view.geometry(config, side, limits, device)),
+        geometry: Some(Geometry::new(view, config, side, limits, device)),
         origins,
     }
 }

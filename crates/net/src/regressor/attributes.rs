@@ -3,9 +3,10 @@
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor, TensorData};
 use glam::Vec3;
-use snapsnap_splat::{Camera, RigidTransform};
+use snapsnap_splat::RigidTransform;
 
-use crate::config::RegressorConfig;
+use crate::config::{Config, RegressorConfig};
+use crate::network::nominal_camera;
 use crate::painter::CanvasView;
 
 /// Gaussian attributes of N pixels.
@@ -63,10 +64,10 @@ const LOG_SCALE: f64 = 2.0;
 const MOST_SPACING: f32 = 3.0;
 
 impl Geometry {
-    /// The geometry of a view's valid pixels, row by row. The world of `camera` is the frame of the points.
-    pub fn new(view: &CanvasView, camera: &Camera, limits: Limits, device: &Device) -> Self {
-        let CanvasView { image, points, valid, .. } = *view;
-        let side = camera.width as usize;
+    /// The geometry of a view's valid pixels, row by row, on a canvas of `side`² pixels.
+    pub fn new(view: &CanvasView, config: &Config, side: usize, limits: Limits, device: &Device) -> Self {
+        let CanvasView { view, image, points, valid } = *view;
+        let camera = nominal_camera(view, config.network.pair_degrees, side);
         let RigidTransform { rotation, translation } = camera.world_to_camera;
         let depth = |point: Vec3| (rotation.row(2).dot(point.as_dvec3()) + translation.z) as f32;
         let point = |i: usize| Vec3::from_slice(&points[3 * i..]);
