@@ -4,14 +4,12 @@
 use burn::nn::PaddingConfig2d;
 use burn::nn::conv::Conv2d;
 use burn::tensor::activation::sigmoid;
-use burn::tensor::module::max_pool2d;
-use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor, TensorData};
 use snapsnap_ops::{bilinear, host, layers};
 
 use Block::{Halved, Residual, Wider};
 
-use crate::u2net::convolution;
+use crate::u2net::{convolution, halved};
 use crate::weights::{Source, WeightsError};
 
 /// Side of the network's input and of its mask in pixels.
@@ -139,7 +137,7 @@ impl BlazePose {
         }
         for block in 0..BRANCH {
             let part = clipped(plain(x.clone()));
-            let before = if HALVED.contains(&block) { max_pool2d(x, MaxPoolOptions::new([2, 2])) } else { x };
+            let before = if HALVED.contains(&block) { halved(x) } else { x };
             x = clipped(before + plain(part));
         }
         let values = host(plain(x.clone()));

@@ -139,7 +139,7 @@ fn joined(coarse: Tensor<4>, fine: Tensor<4>) -> Tensor<4> {
     Tensor::cat(vec![bilinear(coarse, [height, width], false), fine], 1)
 }
 
-fn halved(x: Tensor<4>) -> Tensor<4> {
+pub(crate) fn halved(x: Tensor<4>) -> Tensor<4> {
     max_pool2d(x, MaxPoolOptions::new([2, 2]))
 }
 
