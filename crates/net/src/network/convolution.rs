@@ -51,16 +51,6 @@ impl PointUNet {
         Self { side_attention: None, side_decoder: None, completion: None, ..self }
     }
 
-    /// Whether the network has layers of the unseen sides.
-    pub fn has_sides(&self) -> bool {
-        self.side_decoder.is_some() || self.completion.is_some()
-    }
-
-    /// Both photographs `[B, C, H, W]`, H and W multiples of the patch.
-    pub fn encode(&self, front: Tensor<4>, back: Tensor<4>) -> Levels {
-        self.body.encode(Tensor::cat(vec![front, back], 1), None)
-    }
-
     /// Raw x, y, z, confidence `[B, 4, H, W]` of the front and the back from their features.
     pub fn photographed(&self, features: Tensor<4>) -> [Tensor<4>; 2] {
         self.pair(self.body.decoder.out(features))

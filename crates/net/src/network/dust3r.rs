@@ -95,11 +95,6 @@ impl Dust3r {
         name.contains("downstream_head") && (name.ends_with(".head.4") || name.ends_with(".proj"))
     }
 
-    /// Whether the network has heads for the unseen sides.
-    pub fn has_sides(&self) -> bool {
-        self.downstream_head3.is_some()
-    }
-
     /// Images `[B, C, H, W]`, colours in [−1, 1] first → normalised encoder tokens `[B, N, enc_dim]`. The token
     /// `grid` has rows and columns.
     pub fn encode(&self, images: Tensor<4>, grid: [usize; 2]) -> Tensor<3> {

@@ -184,21 +184,18 @@ impl PointPredictor {
     }
 
     /// The same network without the layers of the unseen sides.
-    pub fn without_sides(self) -> Self {
-        let body = match self.body {
+    pub fn without_sides(mut self) -> Self {
+        self.config.side_heads = false;
+        self.body = match self.body {
             Body::Transformer(net) => Body::Transformer(net.without_sides()),
             Body::Convolution(net) => Body::Convolution(net.without_sides()),
         };
-        Self { body, ..self }
+        self
     }
 
     /// Views of the maps.
     pub fn views(&self) -> &'static [View] {
-        let sides = match &self.body {
-            Body::Transformer(net) => net.has_sides(),
-            Body::Convolution(net) => net.has_sides(),
-        };
-        match (sides, self.config.second_layer) {
+        match (self.config.side_heads, self.config.second_layer) {
             (true, true) => &View::WITH_SECOND,
             (true, false) => &View::ALL,
             (false, _) => &View::ALL[..2],
@@ -263,7 +260,7 @@ impl PointPredictor {
             Body::Convolution(net) => {
                 let b = images.dims()[0] / 2;
                 let (front, back) = (images.clone().narrow(0, 0, b), images.narrow(0, b, b));
-                Encoded::Levels(net.encode(front, back))
+                Encoded::Levels(net.body.encode(Tensor::cat(vec![front, back], 1), None))
             }
         }
     }
