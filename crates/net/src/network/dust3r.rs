@@ -139,22 +139,15 @@ impl Dust3r {
             View::Left => self.downstream_head4.as_ref().expect("a network with side heads"),
             View::RightSecond | View::LeftSecond => panic!("the transformer has no second surfaces"),
         };
-        let tokens = |i: usize| match view {
-            View::Front => front[i].clone(),
-            View::Back => back[i].clone(),
-            _ => self.fuse(front[i].clone(), back[i].clone()),
+        let tokens = |i: usize| match (view, self.config.fusion) {
+            (View::Front, _) => front[i].clone(),
+            (View::Back, _) => back[i].clone(),
+            (_, Fusion::Mean) => (front[i].clone() + back[i].clone()) * 0.5,
+            (_, Fusion::Concat) => Tensor::cat(vec![front[i].clone(), back[i].clone()], 2),
         };
         match head {
             Head::Linear(head) => head.forward(tokens(self.config.dec_depth), grid),
             Head::Dpt(head) => head.forward(self.config.hooks.map(tokens), grid),
-        }
-    }
-
-    /// Tokens of an unseen side.
-    fn fuse(&self, front: Tensor<3>, back: Tensor<3>) -> Tensor<3> {
-        match self.config.fusion {
-            Fusion::Mean => (front + back) * 0.5,
-            Fusion::Concat => Tensor::cat(vec![front, back], 2),
         }
     }
 }
