@@ -4,7 +4,6 @@
 
 use std::ops::Range;
 
-use burn::module::Module;
 use burn::tensor::module::avg_pool2d;
 use burn::tensor::ops::AvgPoolOptions;
 use burn::tensor::{Device, Tensor};
@@ -33,25 +32,16 @@ const MIN_SHARE: f64 = 1e-3;
 const LAST_DIM: usize = 16;
 
 /// The network of details.
-#[derive(Module, Debug)]
-pub(super) struct Details {
-    body: UNet,
-    #[module(skip)]
-    pub(super) resolution: usize,
-}
-
-impl Details {
-    pub(super) fn new(config: &DetailsConfig, device: &Device) -> Self {
-        let sizes = UNetSizes {
-            inputs: INPUTS,
-            outputs: PATCH * PATCH,
-            widths: config.dims,
-            blocks: [config.dims[3], 0, 1],
-            stride: 1,
-            last_dim: LAST_DIM,
-        };
-        Self { body: UNet::new(&sizes, device), resolution: config.resolution }
-    }
+pub(super) fn network(config: &DetailsConfig, device: &Device) -> UNet {
+    let sizes = UNetSizes {
+        inputs: INPUTS,
+        outputs: PATCH * PATCH,
+        widths: config.dims,
+        blocks: [config.dims[3], 0, 1],
+        stride: 1,
+        last_dim: LAST_DIM,
+    };
+    UNet::new(&sizes, device)
 }
 
 /// The pixels of each patch as channels: `[B, C, h, w]` → `[B, C·PATCH², h/PATCH, w/PATCH]`.
@@ -97,7 +87,7 @@ impl PointPredictor {
         columns: Range<usize>,
     ) -> Vec<(View, PointMap)> {
         let [canvas, coarse] = [self.config.resolution, self.config.net_resolution];
-        let fine = self.details.as_ref().expect("a network of details").resolution;
+        let fine = self.config.details.as_ref().expect("a network of details").resolution;
         let look = self.second_look(maps, images, masks, window);
         let [h, w] = look.size();
         let shown = look.images.narrow(3, columns.start / PATCH, columns.len() / PATCH);
@@ -133,7 +123,7 @@ impl PointPredictor {
         masks: &Tensor<4>,
         window: &Window,
     ) -> SecondLook {
-        let fine = self.details.as_ref().expect("a network of details").resolution;
+        let fine = self.config.details.as_ref().expect("a network of details").resolution;
         let [canvas, coarse] = [self.config.resolution, self.config.net_resolution];
         let device = masks.device();
         let small = |x: Tensor<4>, size: usize| shrink(window.cut(x), canvas / size, Downsample::Area);
@@ -186,7 +176,7 @@ impl PointPredictor {
     /// # Panics
     /// Without a network of details.
     pub fn relief(&self, images: Tensor<4>) -> Tensor<4> {
-        let body = &self.details.as_ref().expect("a network of details").body;
+        let body = self.details.as_ref().expect("a network of details");
         joined(body.decoder.out(body.features(&body.encode(images, None)))) * UNIT
     }
 }

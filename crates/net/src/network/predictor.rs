@@ -6,11 +6,11 @@ use burn::tensor::{Device, Tensor};
 
 use super::completion::Photographed;
 use super::convolution::PointUNet;
-use super::details::Details;
+use super::details;
 use super::dust3r::{Dust3r, TokenMaps};
 use super::input::Input;
 use super::rays::{anchors, on_rays};
-use super::unet::Levels;
+use super::unet::{Levels, UNet};
 use super::view::View;
 use crate::config::{self, Anchor, ConfMode, Config, Downsample, NetworkConfig, Upsample};
 use crate::resample::shrink;
@@ -166,7 +166,7 @@ pub struct PointPredictor {
     /// δ `[1]`: metres per network unit.
     scale: Param<Tensor<1>>,
     pub(super) body: Body,
-    pub(super) details: Option<Details>,
+    pub(super) details: Option<UNet>,
     #[module(skip)]
     pub(super) config: NetworkConfig,
 }
@@ -179,7 +179,7 @@ impl PointPredictor {
             config::Body::Transformer => Body::Transformer(Dust3r::new(config, device)),
             config::Body::Convolution => Body::Convolution(PointUNet::new(config, device)),
         };
-        let details = config.details.as_ref().map(|details| Details::new(details, device));
+        let details = config.details.as_ref().map(|details| details::network(details, device));
         Self { scale, body, details, config: config.clone() }
     }
 
