@@ -50,20 +50,11 @@ impl ResBlock {
     }
 }
 
+/// Residual blocks, and a convolution behind them if the size changes.
 #[derive(Module, Debug)]
-pub(crate) struct DownBlock {
+pub(crate) struct Blocks {
     pub nets: Vec<ResBlock>,
     pub downsample: Option<Conv2d>,
-}
-
-#[derive(Module, Debug)]
-pub(crate) struct MidBlock {
-    pub nets: Vec<ResBlock>,
-}
-
-#[derive(Module, Debug)]
-pub(crate) struct UpBlock {
-    pub nets: Vec<ResBlock>,
     pub upsample: Option<Conv2d>,
 }
 
@@ -71,9 +62,9 @@ pub(crate) struct UpBlock {
 #[derive(Module, Debug)]
 pub struct UNet {
     pub(crate) conv_in: Conv2d,
-    pub(crate) down_blocks: Vec<DownBlock>,
-    pub(crate) mid_block: MidBlock,
-    pub(crate) up_blocks: Vec<UpBlock>,
+    pub(crate) down_blocks: Vec<Blocks>,
+    pub(crate) mid_block: Blocks,
+    pub(crate) up_blocks: Vec<Blocks>,
     pub(crate) norm_out: GroupNorm,
     pub(crate) conv_out: Conv2d,
 }
@@ -85,15 +76,17 @@ impl UNet {
         Self {
             conv_in: conv3x3(INPUT_CHANNELS, c, 1, true, device),
             down_blocks: (0..LEVELS)
-                .map(|level| DownBlock {
+                .map(|level| Blocks {
                     nets: blocks(2, c),
                     downsample: (level + 1 < LEVELS).then(|| conv3x3(c, c, 2, true, device)),
+                    upsample: None,
                 })
                 .collect(),
-            mid_block: MidBlock { nets: blocks(2, c) },
+            mid_block: Blocks { nets: blocks(2, c), downsample: None, upsample: None },
             up_blocks: (0..LEVELS)
-                .map(|level| UpBlock {
+                .map(|level| Blocks {
                     nets: blocks(3, 2 * c),
+                    downsample: None,
                     upsample: (level + 1 < LEVELS).then(|| conv3x3(c, c, 1, true, device)),
                 })
                 .collect(),
