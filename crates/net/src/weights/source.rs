@@ -242,18 +242,13 @@ impl Precision {
     }
 
     fn widen(self, bytes: &[u8], values: &mut [f32]) {
-        let halves = || bytes.as_chunks::<2>().0.iter();
+        fn each<const N: usize>(bytes: &[u8], values: &mut [f32], number: impl Fn([u8; N]) -> f32) {
+            values.iter_mut().zip(bytes.as_chunks().0).for_each(|(v, b)| *v = number(*b));
+        }
         match self {
-            Self::F32 => {
-                let words = bytes.as_chunks::<4>().0;
-                values.iter_mut().zip(words).for_each(|(v, b)| *v = f32::from_le_bytes(*b));
-            }
-            Self::F16 => {
-                values.iter_mut().zip(halves()).for_each(|(v, b)| *v = f16::from_le_bytes(*b).to_f32());
-            }
-            Self::Bf16 => {
-                values.iter_mut().zip(halves()).for_each(|(v, b)| *v = bf16::from_le_bytes(*b).to_f32());
-            }
+            Self::F32 => each(bytes, values, f32::from_le_bytes),
+            Self::F16 => each(bytes, values, |b| f16::from_le_bytes(b).to_f32()),
+            Self::Bf16 => each(bytes, values, |b| bf16::from_le_bytes(b).to_f32()),
         }
     }
 }
