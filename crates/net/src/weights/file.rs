@@ -243,14 +243,11 @@ impl WeightFile {
         if parts.contains(&part) {
             return Ok(());
         }
-        let message = match part {
-            Part::PointPredictor => {
-                "has no point predictor (`dust3r.*`, `unet.*`): import a stage-1 checkpoint as well"
-            }
-            Part::Regressor => {
-                "has no Gaussian regressor (`pred_unet.*`, `gs_conv.*`): import a stage-2 checkpoint as well"
-            }
+        let (name, keys, stage) = match part {
+            Part::PointPredictor => ("point predictor", "`dust3r.*`, `unet.*`", 1),
+            Part::Regressor => ("Gaussian regressor", "`pred_unet.*`, `gs_conv.*`", 2),
         };
+        let message = format!("has no {name} ({keys}): import a stage-{stage} checkpoint as well");
         Err(FileError::unsuitable(self.path(), message).into())
     }
 }
@@ -273,16 +270,10 @@ pub(super) fn parts_of<'a>(keys: impl Iterator<Item = &'a String>) -> HashSet<Pa
 
 /// A line for a tensor of the wrong shape or type.
 pub(super) fn mismatch(spec: &TensorSpec, entry: &Entry, path: &Path) -> Option<String> {
-    if Precision::called(&entry.dtype).is_none() {
-        return Some(format!(
-            "wrong type: {} is {} in {}, must be f32, f16 or bf16",
-            spec.name,
-            entry.dtype,
-            path.display()
-        ));
+    let (name, file, Entry { dtype, shape: found, .. }) = (&spec.name, path.display(), entry);
+    if Precision::called(dtype).is_none() {
+        return Some(format!("wrong type: {name} is {dtype} in {file}, must be f32, f16 or bf16"));
     }
-    (entry.shape != spec.shape).then(|| {
-        let (name, file, found) = (&spec.name, path.display(), &entry.shape);
-        format!("wrong shape: {name} is {found:?} in {file}, the config asks for {:?}", spec.shape)
-    })
+    (*found != spec.shape)
+        .then(|| format!("wrong shape: {name} is {found:?} in {file}, the config asks for {:?}", spec.shape))
 }

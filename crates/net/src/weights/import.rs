@@ -64,11 +64,6 @@ pub struct ImportReport {
 /// A file and a key in it.
 type Place<'a> = (&'a Source, String);
 
-/// Keys of the authors' files that neither inference nor training uses.
-fn is_ignored(key: &str) -> bool {
-    key == "mask_token" || key.starts_with("prediction_head.")
-}
-
 /// The second name under which PyTorch lists a `layerN_rn` convolution (docs/method.md, "Weight files").
 fn alias_of(name: &str) -> Option<String> {
     let (head, digit) = name.strip_suffix("_rn.weight")?.rsplit_once("scratch.layer")?;
@@ -225,7 +220,9 @@ fn collect<'a>(
     for source in sources {
         let mut ignored = Vec::new();
         for key in source.tensors().keys() {
-            if is_ignored(key.strip_prefix(DUST3R).unwrap_or(key)) {
+            // Neither inference nor training uses these keys of the authors' files.
+            let bare = key.strip_prefix(DUST3R).unwrap_or(key);
+            if bare == "mask_token" || bare.starts_with("prediction_head.") {
                 ignored.push(key.as_str());
                 continue;
             }
