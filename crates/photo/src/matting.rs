@@ -76,8 +76,11 @@ pub fn matte(
     let part = match &look {
         Some(look) => around(look.person, whole),
         None => {
-            let (_, subject) = largest(&found(&picture, whole, segment))?;
-            around(subject_box(subject, whole), whole)
+            // From pixels of the network to pixels of the picture.
+            let (_, Rect { x, y, width, height }) = largest(&found(&picture, whole, segment))?;
+            let scale = Vec2::new(whole.width as f32, whole.height as f32) / SIDE as f32;
+            let corners = [(x, y), (x + width, y + height)];
+            around(corners.map(|(x, y)| scale * Vec2::new(x as f32, y as f32)), whole)
         }
     };
     // Now the person fills the picture.
@@ -89,7 +92,10 @@ pub fn matte(
 
     let mut mask = GrayImage::new(picture.width(), picture.height());
     let person = imageops::crop_imm(&picture, part.x, part.y, part.width, part.height).to_image();
-    let size = filtered_size(part);
+    // Rows and columns of the pictures on which filters are computed.
+    let longer = part.width.max(part.height);
+    let scaled = |length: u32| (length * FILTERED.min(longer)).div_ceil(longer).max(1) as usize;
+    let size = [scaled(part.height), scaled(part.width)];
     let mut probability = bilinear(probability, [SIDE; 2], size);
     if let Some(look) = &look {
         let scale = size[0] as f32 / part.height as f32 / look.scale();
@@ -157,13 +163,6 @@ fn largest(probability: &[f32]) -> Option<(Vec<bool>, Rect)> {
     Some((near.iter().map(|share| *share > 1e-6).collect(), *person))
 }
 
-/// A box in pixels of [`SIDE`] as corners in pixels of the picture.
-fn subject_box(subject: Rect, whole: Rect) -> [Vec2; 2] {
-    let Rect { x, y, width, height } = subject;
-    let scale = Vec2::new(whole.width as f32, whole.height as f32) / SIDE as f32;
-    [(x, y), (x + width, y + height)].map(|(x, y)| scale * Vec2::new(x as f32, y as f32))
-}
-
 /// Adds the margin to a box.
 fn around([low, high]: [Vec2; 2], whole: Rect) -> Rect {
     let margin = MARGIN * (high - low).max_element();
@@ -173,13 +172,6 @@ fn around([low, high]: [Vec2; 2], whole: Rect) -> Rect {
     };
     let ((x0, x1), (y0, y1)) = (span(low.x, high.x, whole.width), span(low.y, high.y, whole.height));
     Rect { x: x0, y: y0, width: x1 - x0, height: y1 - y0 }
-}
-
-/// Rows and columns of the pictures on which filters are computed.
-fn filtered_size(part: Rect) -> [usize; 2] {
-    let longer = part.width.max(part.height);
-    let scaled = |length: u32| (length * FILTERED.min(longer)).div_ceil(longer).max(1) as usize;
-    [scaled(part.height), scaled(part.width)]
 }
 
 /// The filters of a picture and its probabilities `p` at `size` (rows, columns), which are interpolated at full
