@@ -216,13 +216,6 @@ fn share(length: u32, value: impl Fn(u32) -> u8) -> f32 {
     (0..length).filter(|at| value(*at) >= INSIDE).count() as f32 / length as f32
 }
 
-/// The pixel at a place of the grid over the person's box, mirrored or not.
-fn place(person: Rect, x: u32, y: u32, mirrored: bool) -> (u32, u32) {
-    let x = if mirrored { GRID - 1 - x } else { x };
-    let at = |first: u32, length: u32, i: u32| first + (2 * i + 1) * length / (2 * GRID);
-    (at(person.x, person.width, x), at(person.y, person.height, y))
-}
-
 /// Intersection over union of the front's and the mirrored back's silhouette, at one height and where they overlap
 /// most. Widths may differ: an arm looks longer in the photograph in which it is nearer to the camera.
 fn overlap(front: &Cutout, back: &Cutout) -> f32 {
@@ -257,9 +250,13 @@ fn silhouette(one: &Cutout, mirrored: bool) -> Vec<Vec<bool>> {
 /// Whether the person has the same colours in both pictures, or in one and the mirror image of the other.
 fn are_equal(front: &Cutout, back: &Cutout, mirrored: bool) -> bool {
     let (mut sum, mut count) = (0.0, 0);
-    for (x, y) in (0..GRID).flat_map(|y| (0..GRID).map(move |x| (x, y))) {
-        let [a, b] = [(front, false), (back, mirrored)].map(|(one, mirrored)| {
-            let (x, y) = place(one.report.person, x, y, mirrored);
+    // Cells of a grid over the person's box.
+    let at = |first: u32, length: u32, cell: u32| first + (2 * cell + 1) * length / (2 * GRID);
+    for (column, row) in (0..GRID).flat_map(|row| (0..GRID).map(move |column| (column, row))) {
+        let other = if mirrored { GRID - 1 - column } else { column };
+        let [a, b] = [(front, column), (back, other)].map(|(one, column)| {
+            let person = one.report.person;
+            let (x, y) = (at(person.x, person.width, column), at(person.y, person.height, row));
             (one.rgb.get_pixel(x, y).0.map(f32::from), one.mask.get_pixel(x, y)[0] >= INSIDE)
         });
         if a.1 || b.1 {
