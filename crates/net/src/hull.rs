@@ -122,17 +122,12 @@ fn spread(inside: &[bool], [lines, length]: [usize; 2], strides: [usize; 2], mar
     let mut out = vec![false; inside.len()];
     for line in 0..lines {
         let at = |i: usize| line * strides[0] + i * strides[1];
-        // One past the last pixel that the set pixels before `next` reach.
+        // One past the last pixel that the set pixels before reach.
         let mut reach = 0;
-        let mut next = 0;
-        for i in 0..length {
-            while next < length && next <= i.saturating_add(margin) {
-                if inside[at(next)] {
-                    reach = next.saturating_add(margin).saturating_add(1);
-                }
-                next += 1;
-            }
-            out[at(i)] = i < reach;
+        for i in (0..length).filter(|i| inside[at(*i)]) {
+            let end = i.saturating_add(margin).min(length - 1) + 1;
+            (i.saturating_sub(margin).max(reach)..end).for_each(|near| out[at(near)] = true);
+            reach = end;
         }
     }
     out
