@@ -27,10 +27,8 @@ impl SelfAttention {
 
     /// `[B, N, dim]` → `[B, N, dim]`.
     pub(crate) fn forward(&self, x: Tensor<3>, rope: &Rope) -> Tensor<3> {
-        linear(
-            &self.proj,
-            rotary_self_attention(linear(&self.qkv, x), rope, self.heads, is_bf16(&self.proj.weight)),
-        )
+        let is_bf16 = is_bf16(&self.proj.weight);
+        linear(&self.proj, rotary_self_attention(linear(&self.qkv, x), rope, self.heads, is_bf16))
     }
 }
 
