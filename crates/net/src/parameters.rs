@@ -68,12 +68,6 @@ struct Traversal<'a, T> {
     inner: &'a mut T,
 }
 
-impl<'a, T> Traversal<'a, T> {
-    fn new(prefix: &'a str, inner: &'a mut T) -> Self {
-        Self { path: ParameterPath { prefix, open: Vec::new() }, inner }
-    }
-}
-
 impl<V: NamedVisitor> ModuleVisitor for Traversal<'_, V> {
     fn enter_module(&mut self, name: &str, container_type: &str) {
         self.path.enter(name, container_type);
@@ -104,10 +98,12 @@ impl<M: NamedMapper> ModuleMapper for Traversal<'_, M> {
 
 /// Visits every parameter of `module` in a fixed order. Names begin with `prefix`.
 pub fn visit_named<M: Module>(module: &M, prefix: &str, visitor: &mut impl NamedVisitor) {
-    module.visit(&mut Traversal::new(prefix, visitor));
+    let path = ParameterPath { prefix, open: Vec::new() };
+    module.visit(&mut Traversal { path, inner: visitor });
 }
 
 /// Changes every parameter of `module` in the order of [`visit_named`]. Names begin with `prefix`.
 pub fn map_named<M: Module>(module: M, prefix: &str, mapper: &mut impl NamedMapper) -> M {
-    module.map(&mut Traversal::new(prefix, mapper))
+    let path = ParameterPath { prefix, open: Vec::new() };
+    module.map(&mut Traversal { path, inner: mapper })
 }
