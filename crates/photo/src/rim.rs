@@ -142,15 +142,10 @@ impl Colors {
         }
         let own: Vec<Vec3> = rim.pixels.iter().map(|at| color(*at)).collect();
         // The person's colour comes outwards from behind the rim, the background's inwards from beyond it.
-        let inside = outwards(rim, rgb, &index, own.clone());
-        let mut beyond: Vec<Vec3> = rim.beyond.iter().map(|at| color(*at)).collect();
+        let inside = carried(rim, &rim.pixels, rgb, &index, own.clone());
+        let beyond: Vec<Vec3> = rim.beyond.iter().map(|at| color(*at)).collect();
         let is_flat = beyond.windows(2).all(|pair| pair[0] == pair[1]);
-        for (i, &at) in rim.beyond.iter().enumerate().rev() {
-            let farther = rim.neighbours(at).filter(|to| rim.levels[*to] == rim.levels[at] - 1);
-            if let Some(color) = mean(farther.map(|to| beyond[index[to] as usize])) {
-                beyond[i] = color;
-            }
-        }
+        let beyond = carried(rim, &rim.beyond, rgb, &index, beyond);
         let mut outside = own.clone();
         for (i, &at) in rim.pixels.iter().enumerate() {
             let before = if rim.levels[at] == 1 { -1 } else { rim.levels[at] - 1 };
@@ -183,7 +178,7 @@ impl Colors {
                 next.into_iter().filter_map(|at| Some((at, mean(in_rim(at).filter_map(reached))?))).collect();
         }
         let found = found.iter().zip(&self.own).map(|(found, own)| found.unwrap_or(*own)).collect();
-        outwards(rim, rgb, &self.index, found)
+        carried(rim, &rim.pixels, rgb, &self.index, found)
     }
 
     /// The share of `background` in a pixel of the rim, and whether it differs from the person's colour.
@@ -199,13 +194,14 @@ impl Colors {
     }
 }
 
-/// Colours from behind the rim, carried outwards from level to level. Pixels without deeper neighbours keep `colors`.
-fn outwards(rim: &Rim, rgb: &RgbImage, index: &[u32], mut colors: Vec<Vec3>) -> Vec<Vec3> {
-    for (i, &at) in rim.pixels.iter().enumerate().rev() {
+/// Colours carried from level to level towards the outline, from behind the rim to its `pixels`, or from far outside to
+/// the pixels beyond. Pixels without neighbours farther from the outline keep `colors`.
+fn carried(rim: &Rim, pixels: &[usize], rgb: &RgbImage, index: &[u32], mut colors: Vec<Vec3>) -> Vec<Vec3> {
+    for (i, &at) in pixels.iter().enumerate().rev() {
         let level = rim.levels[at];
         let of = |to: usize| match rim.levels[to] {
-            DEEP => Some(rim.color(rgb, to)),
-            deeper if deeper == level + 1 => Some(colors[index[to] as usize]),
+            DEEP if level > 0 => Some(rim.color(rgb, to)),
+            farther if farther == level + level.signum() => Some(colors[index[to] as usize]),
             _ => None,
         };
         if let Some(color) = mean(rim.neighbours(at).filter_map(of)) {
