@@ -176,10 +176,7 @@ impl<'a> Cutout<'a> {
         let Self { rgb, mask, report, .. } = &*self;
         let (photograph, mapping, canvas) = match placement {
             Placement::AsIs => (on_canvas(rgb, mask), Mapping::AS_IT_IS, Canvas::AsIs),
-            Placement::Training { height } => {
-                let standing = common.unwrap_or(Standing::alone(report.person));
-                placed(rgb, mask, standing, common.is_some(), [height, side])
-            }
+            Placement::Training { height } => placed(rgb, mask, report.person, common, [height, side]),
             Placement::Demo { height } => placed_as_demo(rgb, mask, report.person, [height, side]),
         };
         (self.frame.mapping, self.report.canvas) = (mapping, canvas);

@@ -55,13 +55,6 @@ pub(super) struct Standing {
     axis: f32,
 }
 
-impl Standing {
-    /// A person in a single photograph. The axis is the middle of the box.
-    pub(super) fn alone(person: Rect) -> Self {
-        Self { person, axis: person.x as f32 + person.width as f32 / 2.0 }
-    }
-}
-
 /// The box around the person in both photographs, if they are taken from one place: if their sizes are equal, and the
 /// person's heights and columns nearly so. A person who turns on the spot has the same share left of the axis in front
 /// as right of it behind.
@@ -101,14 +94,17 @@ fn median_column(mask: &GrayImage, person: Rect) -> u32 {
     person.x + before.count() as u32
 }
 
-/// Places the box at the size and place of the training subjects, with soft edges outside the box.
+/// Places the box of both photographs, or of this `person`, whose axis is the middle of the box, at the size and place of
+/// the training subjects, with soft edges outside the box.
 pub(super) fn placed(
     rgb: &RgbImage,
     mask: &GrayImage,
-    Standing { person, axis }: Standing,
-    together: bool,
+    person: Rect,
+    common: Option<Standing>,
     [height, side]: [usize; 2],
 ) -> (Photograph, Mapping, Canvas) {
+    let alone = Standing { person, axis: person.x as f32 + person.width as f32 / 2.0 };
+    let Standing { person, axis } = common.unwrap_or(alone);
     let canvas = side as f32;
     let by_height = height as f32 / REFERENCE_SIDE * canvas / person.height as f32;
     // A person with outstretched arms may be wider than high.
@@ -142,7 +138,7 @@ pub(super) fn placed(
     let color = |value: f32, share: f32| 2.0 * value.clamp(0.0, share) - share;
     let (values, on_canvas) = pasted(&planes, [high, wide], [y0, x0], side, color);
     let place = Place { size: [width, height], at: [left, top], side };
-    let canvas = Canvas::Scaled { together, scale, limited_by_width, place };
+    let canvas = Canvas::Scaled { together: common.is_some(), scale, limited_by_width, place };
     (Photograph::new(values, on_canvas), mapping, canvas)
 }
 
