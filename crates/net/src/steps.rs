@@ -11,7 +11,7 @@ use crate::window::Window;
 /// A step of a run, or one that was left out.
 #[derive(Debug, Clone, PartialEq, Serialize, thiserror::Error)]
 #[serde(tag = "step", rename_all = "kebab-case")]
-#[allow(missing_docs, reason = "the names say it")]
+#[allow(missing_docs, reason = "names and messages say it")]
 pub enum Step {
     /// The point predictor received the `window` of a canvas of this side, reduced to `size` (width, height), as this
     /// many tokens and channels of each photograph.
@@ -32,22 +32,17 @@ pub enum Step {
     /// The network of details received both photographs in this size (width, height).
     #[error("details: 2 photographs of {}×{}, the person's window", .size[0], .size[1])]
     Details { size: [usize; 2] },
-    /// The network of details did not run: the canvas, of this side, has fewer pixels than the network's image of it.
     #[error("details were left out: a canvas of {canvas}² has fewer pixels than their network's image of it")]
     NoDetails { canvas: usize },
-    /// Pixels of the sides moved into the silhouettes.
     #[error("{pixels} pixels of the sides moved into the silhouettes")]
     MovedIntoSilhouettes { pixels: usize },
     /// Pixels of a view that become Gaussians, of all pixels of the canvas.
     #[error("{view}: {pixels} of {of} pixels become Gaussians")]
     Chosen { view: &'static str, pixels: usize, of: usize },
-    /// Pixels left out, since their points are not finite.
     #[error("{pixels} pixels left out: their points are not finite")]
     NotFinite { pixels: usize },
-    /// Pixels of the sides left out, since they lie outside of the silhouettes.
     #[error("{pixels} pixels of the sides left out: they lie outside of the silhouettes")]
     OutsideSilhouettes { pixels: usize },
-    /// Pixels left out, since their points hang between two surfaces.
     #[error("{pixels} pixels left out: their points hang between two surfaces")]
     BetweenSurfaces { pixels: usize },
     /// Colours of the sides were left out: `as_asked` by the caller, else since there are no sides.
@@ -56,25 +51,20 @@ pub enum Step {
     /// The regressor received the `window` of some views of a canvas of this side, with this box around the person.
     #[error("regressor ({views}): {window} of {canvas}×{canvas} pixels each, person's box {person}")]
     Regressor { views: &'static str, window: Window, canvas: usize, person: Window },
-    /// The regressor did not run: no pixel of these views is valid.
     #[error("regressor ({views}) left out: no pixel of these views is valid")]
     NoRegressor { views: &'static str },
-    /// Gaussians between the upper edges of front and back.
     #[error("closed top: {gaussians} Gaussians between the upper edges of front and back")]
     ClosedTop { gaussians: usize },
     /// All Gaussians.
     #[error("{gaussians} Gaussians")]
     Gaussians { gaussians: usize },
-    /// Gaussians left out, since their attributes are not finite.
     #[error("{gaussians} Gaussians left out: their attributes are not finite")]
     GaussiansNotFinite { gaussians: usize },
-    /// Gaussians left out, since they hang off the person's surface.
     #[error("{gaussians} Gaussians left out: they hang off the person's surface")]
     OffSurface { gaussians: usize },
     /// Gaussians whose colours were corrected by the render of their photograph's view.
     #[error("own colours: {gaussians} Gaussians corrected")]
     OwnColors { gaussians: usize },
-    /// Gaussians behind the surface.
     #[error("backing: {gaussians} Gaussians behind the surface")]
     Backing { gaussians: usize },
     /// Several pairs of photographs were reconstructed. The other steps belong to the first pair.

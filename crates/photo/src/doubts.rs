@@ -41,7 +41,7 @@ pub struct Doubt {
 /// What is wrong with photographs.
 #[derive(Debug, Clone, PartialEq, Serialize, thiserror::Error)]
 #[serde(tag = "sign", rename_all = "kebab-case")]
-#[allow(missing_docs, reason = "the names say it")]
+#[allow(missing_docs, reason = "names and messages say it")]
 pub enum Sign {
     /// The mask touches more borders of the picture than a person does.
     #[error("the mask touches {borders} borders of the picture: is it inverted? The person must be white")]
@@ -52,40 +52,28 @@ pub enum Sign {
         .size[0], .size[1]
     )]
     Wide { size: [u32; 2] },
-    /// Both are one picture.
     #[error("this is the same picture twice")]
     Equal,
-    /// One is the mirror image of the other.
     #[error("one is the mirror image of the other")]
     Mirrored,
-    /// The first shows the back, the second the front. They were exchanged.
     #[error("the first shows the back, the second the front: they were exchanged")]
     Swapped,
-    /// Both show the same side.
     #[error("both show the person's {}: one must show the front, one the back", side(*.facing))]
     SameSide { facing: Facing },
-    /// The photograph shows the person from the side.
     #[error("the person is seen from the side, not from the front or back")]
     FromTheSide,
-    /// Nobody is recognised.
     #[error("nobody is recognised in the picture")]
     Nobody,
-    /// Others are beside the person.
     #[error("somebody else is in the picture: only one person is taken")]
     Accompanied,
-    /// The person lies.
     #[error("the person does not stand upright")]
     Lies,
-    /// The person sits.
     #[error("the person seems to sit: the person should stand")]
     Sits,
-    /// The mask leaves out a part of the torso.
     #[error("the mask has a hole in the person's torso")]
     Hole,
-    /// Parts of the body are outside of the picture.
     #[error("outside of the picture: {}: the whole person must be visible", list(.parts))]
     Outside { parts: Vec<Part> },
-    /// Limbs are elsewhere in the mirrored back.
     #[error("elsewhere in the back photograph: {}: both need one pose", list(.parts))]
     Moved { parts: Vec<Part> },
     /// The silhouettes do not fit one another: intersection over union.
