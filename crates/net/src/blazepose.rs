@@ -1,6 +1,8 @@
 //! The network that finds a person's joints and pixels: BlazePose, the full model (Bazarevsky et al., "BlazePose:
 //! On-device Real-time Body Pose Tracking", 2020), with its published weights.
 
+use std::cell::RefCell;
+
 use burn::nn::PaddingConfig2d;
 use burn::nn::conv::Conv2d;
 use burn::tensor::activation::sigmoid;
@@ -88,55 +90,46 @@ impl BlazePose {
 
     /// Colours from 0 to 1, `[3, SIDE, SIDE]` → joints and pixels of the person.
     pub fn forward(&self, rgb: &[f32], device: &Device) -> Pose {
-        let mut row = self.convolutions.iter();
-        let mut plain = |x: Tensor<4>| layers::conv2d(row.next().expect("a layer of the graph"), x, false);
+        let rows = RefCell::new(self.convolutions.iter());
+        let plain = |x: Tensor<4>| {
+            let layer = rows.borrow_mut().next().expect("a layer of the graph");
+            layers::conv2d(layer, x, false)
+        };
+        let rectified = |x: Tensor<4>| clipped(plain(x));
+        let twice = |x: Tensor<4>| rectified(rectified(x));
         let data = TensorData::new(rgb.to_vec(), [1, 3, SIDE, SIDE]);
-        let mut x = Tensor::<4>::from_data(data, device);
-        for _ in 0..2 {
-            x = clipped(plain(x));
-        }
-        x = plain(x);
+        let mut x = plain(twice(Tensor::from_data(data, device)));
         let mut finer = Vec::new();
         for block in BLOCKS {
-            let mut inner = clipped(plain(x.clone()));
+            let wide = rectified(x.clone());
             if block == Halved {
-                let part = clipped(plain(x.clone()));
-                finer.push(clipped(plain(part)));
+                finer.push(twice(x.clone()));
             }
-            inner = clipped(plain(inner));
-            let narrow = plain(inner);
+            let narrow = plain(rectified(wide));
             x = if block == Residual { narrow + x } else { narrow };
         }
-        for _ in 0..2 {
-            x = clipped(plain(x));
-        }
+        x = twice(x);
 
-        let mut separable = |x: Tensor<4>| {
-            let x = clipped(plain(x));
-            clipped(plain(x))
-        };
-        let mut y = separable(x.clone());
+        let mut y = twice(x.clone());
         let finest = finer.remove(0);
         for part in finer.into_iter().rev() {
             y = doubled(y) + part;
         }
-        y = doubled(separable(y)) + finest;
+        y = doubled(twice(y)) + finest;
         for is_doubled in [false, true] {
             if is_doubled {
                 y = doubled(y);
             }
             for _ in 0..2 {
-                let part = clipped(plain(y.clone()));
+                let part = rectified(y.clone());
                 y = clipped(y + plain(part));
             }
         }
         let mask = sigmoid(plain(y));
 
-        for _ in 0..2 {
-            x = clipped(plain(x));
-        }
+        x = twice(x);
         for block in 0..BRANCH {
-            let part = clipped(plain(x.clone()));
+            let part = rectified(x.clone());
             let before = if HALVED.contains(&block) { halved(x) } else { x };
             x = clipped(before + plain(part));
         }
