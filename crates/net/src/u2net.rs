@@ -19,22 +19,9 @@ pub const SIDE: usize = 320;
 /// Mean and standard deviation of the colours in training (ImageNet's).
 const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
-/// The encoder's blocks: the number of levels, and whether levels halve the size or dilate the convolutions instead
+/// The encoder's blocks: the number of levels, and whether levels dilate the convolutions instead of halving the size
 /// (Qin et al., figure 5). The decoder has the first five blocks in reverse order.
-const BLOCKS: [(usize, Levels); 6] = [
-    (7, Levels::Halved),
-    (6, Levels::Halved),
-    (5, Levels::Halved),
-    (4, Levels::Halved),
-    (4, Levels::Dilated),
-    (4, Levels::Dilated),
-];
-
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Levels {
-    Halved,
-    Dilated,
-}
+const BLOCKS: [(usize, bool); 6] = [(7, false), (6, false), (5, false), (4, false), (4, true), (4, true)];
 
 /// U²-Net small, 1.1 million parameters.
 pub struct U2Net {
@@ -48,7 +35,7 @@ pub struct U2Net {
 
 /// A residual U-block.
 struct Block {
-    levels: Levels,
+    is_dilated: bool,
     input: Conv2d,
     down: Vec<Conv2d>,
     bottom: Conv2d,
@@ -69,13 +56,13 @@ impl U2Net {
             let row = rows.next().expect("endless");
             convolution(source, &format!("convolutions.{row}"), dilation, device)
         };
-        let mut block = |(count, levels): (usize, Levels)| {
-            let dilation = |level: usize| if levels == Levels::Dilated { 1 << level } else { 1 };
+        let mut block = |(count, is_dilated): (usize, bool)| {
+            let dilation = |level: usize| if is_dilated { 1 << level } else { 1 };
             Ok::<_, WeightsError>(Block {
-                levels,
+                is_dilated,
                 input: next(1)?,
                 down: (0..count - 1).map(|level| next(dilation(level))).collect::<Result<_, _>>()?,
-                bottom: next(if levels == Levels::Dilated { dilation(count - 1) } else { 2 })?,
+                bottom: next(if is_dilated { dilation(count - 1) } else { 2 })?,
                 up: (0..count - 1).rev().map(|level| next(dilation(level))).collect::<Result<_, _>>()?,
             })
         };
@@ -121,7 +108,7 @@ impl Block {
         let mut x = input.clone();
         let mut kept = Vec::new();
         for layer in &self.down {
-            let smaller = !kept.is_empty() && self.levels == Levels::Halved;
+            let smaller = !kept.is_empty() && !self.is_dilated;
             x = rectified(layer, if smaller { halved(x) } else { x });
             kept.push(x.clone());
         }
