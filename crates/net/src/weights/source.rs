@@ -130,19 +130,12 @@ impl Source {
             })?
             .into_tensors();
         let reader = unwrapped(all.into_iter().collect());
-        let entry = |t: &pytorch_reader::Tensor| Entry {
-            dtype: format!("{:?}", t.dtype()).to_lowercase(),
-            shape: t.shape().to_vec(),
-            start: 0,
-            len: t.byte_len(),
+        let entry = |(name, tensor): (&String, &pytorch_reader::Tensor)| {
+            let dtype = format!("{:?}", tensor.dtype()).to_lowercase();
+            (name.clone(), Entry { dtype, shape: tensor.shape().to_vec(), start: 0, len: tensor.byte_len() })
         };
-        let tensors = reader.iter().map(|(k, t)| (k.clone(), entry(t))).collect();
-        Ok(Self {
-            path: path.to_owned(),
-            tensors,
-            reader: Reader::Pytorch(reader),
-            metadata: BTreeMap::new(),
-        })
+        let (path, tensors) = (path.to_owned(), reader.iter().map(entry).collect());
+        Ok(Self { path, tensors, reader: Reader::Pytorch(reader), metadata: BTreeMap::new() })
     }
 
     /// The file.
