@@ -125,16 +125,15 @@ fn combined(salient: &[f32], pose: &[f32], width: usize, scale: f32) -> Vec<f32>
         let values: Vec<f32> = (0..pose.len()).map(value).collect();
         means(&values, width, ((reach * scale).round() as usize).max(1))
     };
-    let flag = |is_set: bool| f32::from(u8::from(is_set));
-    let person = |i: usize| flag(pose[i] > JUDGED.1);
-    let surroundings = |i: usize| flag(pose[i] < JUDGED.0);
+    let person = |i: usize| f32::from(pose[i] > JUDGED.1);
+    let surroundings = |i: usize| f32::from(pose[i] < JUDGED.0);
     let mean_of = |of: &dyn Fn(usize) -> f32, without: f32| -> Vec<f32> {
         let (areas, sums) = (local(of, COMPARED), local(&|i| of(i) * salient[i], COMPARED));
         areas.iter().zip(sums).map(|(area, sum)| if *area > 1e-3 { sum / area } else { without }).collect()
     };
     let (inside, outside) = (mean_of(&person, 1.0), mean_of(&surroundings, 0.0));
-    let deep = local(&|i| flag(pose[i] > SURE), BAND);
-    let near = local(&|i| flag(pose[i] > LIKELY), BAND);
+    let deep = local(&|i| f32::from(pose[i] > SURE), BAND);
+    let near = local(&|i| f32::from(pose[i] > LIKELY), BAND);
     let value = |i: usize| match between(inside[i] - outside[i], TOLD_APART) {
         _ if deep[i] > 1.0 - 1e-6 => 1.0,
         _ if near[i] < 1e-6 => 0.0,
