@@ -138,7 +138,6 @@ mod tests {
     use glam::DVec2;
 
     use super::*;
-    use crate::network::nominal_camera;
 
     /// The person is the left half of the front photograph (x < 0). The camera of both right surfaces is at x = +2.
     #[test]
