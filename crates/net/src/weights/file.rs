@@ -157,10 +157,7 @@ impl WeightFile {
 
     fn checked(source: Source, config: Option<Config>) -> Result<Self, WeightsError> {
         let path = source.path();
-        let config = match config {
-            Some(config) => config,
-            None => source.config()?,
-        };
+        let config = config.map_or_else(|| source.config(), Ok)?;
         let mut problems = Vec::new();
         let parts = parts_of(source.tensors().keys());
         let expected: Vec<_> =
@@ -184,8 +181,7 @@ impl WeightFile {
         if !own.is_empty() {
             return Err(of_others(path, own));
         }
-        let origin = path.display().to_string();
-        Err(WeightsError::Tensors { origin, problems })
+        Err(WeightsError::Tensors { origin: path.display().to_string(), problems })
     }
 
     /// Refuses weights whose file contains a config in which the tensors of this part mean something else, such as

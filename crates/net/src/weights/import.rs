@@ -180,10 +180,9 @@ fn plan<'a>(
         report.notes.push(format!("head {k} is in no file: drawn from seed {seed}"));
     }
 
-    let mut plan: Vec<Option<Place>> = Vec::new();
-    for spec in specs {
+    let place = |spec: &TensorSpec| {
         let of_absent_head = absent.iter().find(|k| spec.name.starts_with(&head(**k)));
-        let origin = match (found.remove(&spec.name), of_absent_head) {
+        match (found.remove(&spec.name), of_absent_head) {
             (Some((source, key)), _) => {
                 problems.extend(mismatch(spec, &source.tensors()[&key], source.path()));
                 Some((source, key))
@@ -197,9 +196,9 @@ fn plan<'a>(
                 problems.push(format!("missing: {} {:?}", spec.name, spec.shape));
                 None
             }
-        };
-        plan.push(origin);
-    }
+        }
+    };
+    let plan = specs.iter().map(place).collect();
     for (name, (source, _)) in &found {
         let name = name.escape_debug();
         problems.push(format!("not part of the configured networks: {name} in {}", source.path().display()));

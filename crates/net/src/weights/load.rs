@@ -74,13 +74,12 @@ fn fill<M: Module>(
 ) -> Result<M, WeightsError> {
     let mut loader = Loader { source: read, device, problems: Vec::new(), failure: None };
     let module = map_named(module, prefix, &mut loader);
-    if let Some(failure) = loader.failure {
-        return Err(failure);
+    let Loader { problems, failure, .. } = loader;
+    match failure {
+        Some(failure) => Err(failure),
+        None if problems.is_empty() => Ok(module),
+        None => Err(WeightsError::Tensors { origin: origin.to_owned(), problems }),
     }
-    if loader.problems.is_empty() {
-        return Ok(module);
-    }
-    Err(WeightsError::Tensors { origin: origin.to_owned(), problems: loader.problems })
 }
 
 struct Loader<'a> {
