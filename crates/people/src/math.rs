@@ -66,24 +66,3 @@ pub fn noise(p: Vec3, seed: u32) -> f32 {
 pub fn noise2(p: Vec2, seed: u32) -> f32 {
     noise(p.extend(0.5), seed)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn rotations_are_right_handed() {
-        let close = |a: Vec3, b: Vec3| (a - b).length() < 1e-6;
-        assert!(close(rotate_x(90.0) * Vec3::Y, Vec3::Z));
-        assert!(close(rotate_y(90.0) * Vec3::Z, Vec3::X));
-        assert!(close(rotate_z(90.0) * Vec3::X, Vec3::Y));
-    }
-
-    #[test]
-    fn noise_is_continuous_and_fills_its_range() {
-        let values: Vec<f32> = (0..4000).map(|i| noise(Vec3::new(i as f32 * 0.05, 1.3, 7.7), 3)).collect();
-        assert!(values.windows(2).all(|w| (w[0] - w[1]).abs() < 0.1));
-        let (low, high) = values.iter().fold((1.0_f32, 0.0_f32), |(l, h), v| (l.min(*v), h.max(*v)));
-        assert!(low < 0.2 && high > 0.8 && low >= 0.0 && high <= 1.0, "{low} {high}");
-    }
-}
