@@ -6,7 +6,7 @@ use rand::Rng;
 use crate::math::{rotate_x, rotate_y, rotate_z};
 
 /// Proportions of a body.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Build {
     /// Stature in metres.
     pub stature: f32,
@@ -22,22 +22,6 @@ pub struct Build {
     pub shoulders: f32,
     /// Size of the head, 1 on average.
     pub head: f32,
-}
-
-impl Default for Build {
-    /// A body of average proportions.
-    fn default() -> Self {
-        Self {
-            stature: 1.7,
-            sex: 0.5,
-            girth: 1.0,
-            belly: 0.0,
-            legs: 1.0,
-            arms: 1.0,
-            shoulders: 1.0,
-            head: 1.08,
-        }
-    }
 }
 
 impl Build {

@@ -81,6 +81,7 @@ impl Avatars {
 /// A sentence that names a missing joint, or a bone that is not below the hips.
 pub fn placed(bones: &[import::Bone], pose: &Pose) -> Result<Vec<Placed>, String> {
     let skeleton = Skeleton::new(bones)?;
+    // The axes of a figure do not depend on its proportions.
     let goal = Figure::new(Build::default(), pose);
     let placed = skeleton::placed(&skeleton.bones, &skeleton.rest, pose, &goal);
     let row = |(bone, row): (&import::Bone, &Option<usize>)| {
