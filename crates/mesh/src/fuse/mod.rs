@@ -299,11 +299,7 @@ pub fn body(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
     if there.len() < FEWEST {
         return Err(FuseError::Nothing(FEWEST));
     }
-    let mut along = vec![0.0; there.len()];
-    let mut end = |place: &dyn Fn(&(Vec3, f32)) -> f32| {
-        along.iter_mut().zip(&there).for_each(|(along, row)| *along = place(row));
-        f64::from(upper_end(&mut along))
-    };
+    let end = |place: &dyn Fn(&(Vec3, f32)) -> f32| f64::from(upper_end(there.iter().map(place)));
     let (mut low, mut high, mut centres) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
     for axis in 0..3 {
         low[axis] = -end(&|(p, reach)| reach - p[axis]);
@@ -326,7 +322,8 @@ pub fn body(gaussians: &Gaussians) -> Result<(Vec3, Vec3), FuseError> {
 }
 
 /// The largest value but for [`FLYING`] of all. There is one at least.
-fn upper_end(values: &mut [f32]) -> f32 {
+fn upper_end(values: impl Iterator<Item = f32>) -> f32 {
+    let mut values: Vec<f32> = values.collect();
     let skipped = values.len() - 1 - (FLYING * values.len() as f32) as usize;
     *values.select_nth_unstable_by(skipped, f32::total_cmp).1
 }

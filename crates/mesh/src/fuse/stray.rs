@@ -63,11 +63,7 @@ fn body(places: &[Vec3]) -> Option<(Vec3, Vec3)> {
     if places.len() < FEWEST {
         return None;
     }
-    let mut along = vec![0.0; places.len()];
-    let mut end = |place: &dyn Fn(&Vec3) -> f32| {
-        along.iter_mut().zip(places).for_each(|(along, row)| *along = place(row));
-        upper_end(&mut along)
-    };
+    let end = |place: &dyn Fn(&Vec3) -> f32| upper_end(places.iter().map(place));
     let (mut low, mut high) = (Vec3::ZERO, Vec3::ZERO);
     for axis in 0..3 {
         (low[axis], high[axis]) = (-end(&|p| -p[axis]), end(&|p| p[axis]));
