@@ -35,27 +35,19 @@ static AROUND: LazyLock<[(I64Vec3, u16); 14]> = LazyLock::new(|| {
     })
 });
 
-/// Number of connected components of a subset of the 14 corners.
-fn parts(mut corners: u16) -> u32 {
-    let mut parts = 0;
-    while corners != 0 {
-        parts += 1;
-        let mut reached = corners & corners.wrapping_neg();
-        loop {
-            corners &= !reached;
-            let next = AROUND.iter().enumerate().filter(|(i, _)| reached >> i & 1 == 1);
-            reached = next.fold(0, |all, (_, (_, neighbours))| all | neighbours) & corners;
-            if reached == 0 {
-                break;
-            }
-        }
+/// Whether a subset of the 14 corners is connected.
+fn is_connected(corners: u16) -> bool {
+    let (mut before, mut reached) = (0, corners & corners.wrapping_neg());
+    while reached != before {
+        before = reached;
+        let next = AROUND.iter().enumerate().filter(|(i, _)| before >> i & 1 == 1);
+        reached = next.fold(before, |all, (_, (_, neighbours))| all | (neighbours & corners));
     }
-    parts
+    corners != 0 && reached == corners
 }
 
-/// For each subset of the 14 corners whether it is connected.
-static CONNECTED: LazyLock<Vec<bool>> =
-    LazyLock::new(|| (0..1_u16 << 14).map(|corners| parts(corners) == 1).collect());
+/// [`is_connected`] of each subset of the 14 corners.
+static CONNECTED: LazyLock<Vec<bool>> = LazyLock::new(|| (0..1_u16 << 14).map(is_connected).collect());
 
 impl Grid {
     /// Joins parts with the body by the shortest paths through the outside, three cubes thick. Returns the part count.
