@@ -125,9 +125,7 @@ fn decode_from(
     let is_bmp = reader.format() == Some(ImageFormat::Bmp);
     let (picture, turn, icc) = if reader.format() == Some(ImageFormat::Jpeg) {
         let bytes = jpeg::tidied(whole(path, reader.into_inner())?);
-        let jpeg = jpeg::Jpeg::open(&bytes).map_err(&failed)?;
-        check(jpeg.size, 0)?;
-        jpeg.decode().map_err(&failed)?
+        jpeg::decode(path, &bytes, |size| check(size, 0))?
     } else {
         let mut decoder = reader.into_decoder().map_err(&failed)?;
         check(decoder.dimensions().into(), decoder.total_bytes())?;

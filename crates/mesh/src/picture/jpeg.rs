@@ -1,67 +1,57 @@
 //! Strict decoding of JPEG files. The image crate's decoder fills the missing part of a truncated file with grey.
 
+use std::path::Path;
+
 use image::error::{DecodingError, ImageFormatHint};
 use image::metadata::Orientation;
 use image::{DynamicImage, GrayImage, ImageError, ImageFormat, RgbImage};
+use snapsnap_base::FileError;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-use super::orientation;
+use super::{orientation, unreadable};
 
 /// Largest number of pixels per byte of a JPEG: each 8×8 block takes at least one bit.
 const MAX_PIXELS_PER_BYTE: u64 = 512;
 
-/// A JPEG whose header has been read.
-pub struct Jpeg<'a> {
-    decoder: JpegDecoder<ZCursor<&'a [u8]>>,
-    /// Width and height as stored.
-    pub size: [u32; 2],
-    is_grey: bool,
-}
-
 /// A picture as it is stored, its orientation, and its ICC profile.
 type Decoded = (DynamicImage, Option<Orientation>, Option<Vec<u8>>);
 
-fn damaged(message: impl ToString) -> ImageError {
-    let message = message.to_string();
-    ImageError::Decoding(DecodingError::new(ImageFormatHint::Exact(ImageFormat::Jpeg), message))
-}
-
-impl<'a> Jpeg<'a> {
-    /// Reads the header, and checks that the file contains the end of the image.
-    pub fn open(bytes: &'a [u8]) -> Result<Self, ImageError> {
-        let options = DecoderOptions::default()
-            .set_strict_mode(true)
-            .set_max_width(usize::MAX)
-            .set_max_height(usize::MAX);
-        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
-        decoder.decode_headers().map_err(|e| damaged(format!("{e:?}")))?;
-        let (width, height) = decoder.dimensions().ok_or_else(|| damaged("its size is missing"))?;
-        // Otherwise a file of a few bytes could claim gigabytes.
-        if (width * height) as u64 > MAX_PIXELS_PER_BYTE * bytes.len() as u64 || !is_whole(bytes) {
-            return Err(damaged("the file ends before the picture does"));
-        }
-        let is_grey = matches!(decoder.input_colorspace(), Some(ColorSpace::Luma | ColorSpace::LumaA));
-        let color = if is_grey { ColorSpace::Luma } else { ColorSpace::RGB };
-        decoder.set_options(options.jpeg_set_out_colorspace(color));
-        Ok(Self { decoder, size: [width as u32, height as u32], is_grey })
+/// Decodes a picture if the file contains its end, and if `check` accepts its width and height as stored.
+pub fn decode(
+    path: &Path,
+    bytes: &[u8],
+    check: impl FnOnce([u32; 2]) -> Result<(), FileError>,
+) -> Result<Decoded, FileError> {
+    let damaged = |message: String| {
+        let hint = ImageFormatHint::Exact(ImageFormat::Jpeg);
+        unreadable(path)(ImageError::Decoding(DecodingError::new(hint, message)))
+    };
+    let options =
+        DecoderOptions::default().set_strict_mode(true).set_max_width(usize::MAX).set_max_height(usize::MAX);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+    decoder.decode_headers().map_err(|e| damaged(format!("{e:?}")))?;
+    let (width, height) = decoder.dimensions().ok_or_else(|| damaged("its size is missing".into()))?;
+    // Otherwise a file of a few bytes could claim gigabytes.
+    if (width * height) as u64 > MAX_PIXELS_PER_BYTE * bytes.len() as u64 || !is_whole(bytes) {
+        return Err(damaged("the file ends before the picture does".into()));
     }
-
-    /// Decodes the picture.
-    pub fn decode(mut self) -> Result<Decoded, ImageError> {
-        let pixels = self.decoder.decode().map_err(|e| damaged(format!("{e:?}")))?;
-        let orientation = self.decoder.exif().cloned().and_then(orientation);
-        let [width, height] = self.size;
-        let picture = if self.is_grey {
-            GrayImage::from_raw(width, height, pixels).map(DynamicImage::ImageLuma8)
-        } else {
-            RgbImage::from_raw(width, height, pixels).map(DynamicImage::ImageRgb8)
-        };
-        let picture = picture.ok_or_else(|| damaged("it contains fewer pixels than its header promises"))?;
-        Ok((picture, orientation, self.decoder.icc_profile()))
-    }
+    let [width, height] = [width as u32, height as u32];
+    check([width, height])?;
+    let is_grey = matches!(decoder.input_colorspace(), Some(ColorSpace::Luma | ColorSpace::LumaA));
+    let color = if is_grey { ColorSpace::Luma } else { ColorSpace::RGB };
+    decoder.set_options(options.jpeg_set_out_colorspace(color));
+    let pixels = decoder.decode().map_err(|e| damaged(format!("{e:?}")))?;
+    let picture = if is_grey {
+        GrayImage::from_raw(width, height, pixels).map(DynamicImage::ImageLuma8)
+    } else {
+        RgbImage::from_raw(width, height, pixels).map(DynamicImage::ImageRgb8)
+    };
+    let missing = || damaged("it contains fewer pixels than its header promises".into());
+    let orientation = decoder.exif().cloned().and_then(orientation);
+    Ok((picture.ok_or_else(missing)?, orientation, decoder.icc_profile()))
 }
 
 /// A JPEG without stray bytes between the segments of its header.
