@@ -12,7 +12,7 @@ use std::path::Path;
 use exif::{In, Tag};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
-
+use moxcms::ColorProfile;
 use snapsnap_base::{FileError, file, guarded};
 
 /// Memory limit of a decoded photograph, mask or view in bytes: 201 million RGBA pixels, the largest picture that
@@ -116,10 +116,7 @@ fn decode_from(
         check(size, needed)?;
         let picture = heic::decode(&bytes).map_err(&failed)?;
         let profile = in_srgb.then(|| heic::profile(&bytes)).flatten();
-        return Ok(match profile {
-            Some(profile) => profile::from_profile(picture, &profile),
-            None => picture,
-        });
+        return Ok(profile::to_srgb(picture, profile));
     }
     let reader = ImageReader::new(source).with_guessed_format().map_err(FileError::read(path))?;
     let is_bmp = reader.format() == Some(ImageFormat::Bmp);
@@ -140,7 +137,9 @@ fn decode_from(
         picture.color().has_alpha() && picture.to_rgba8().pixels().all(|pixel| pixel.0[3] == 0)
     };
     let picture = if is_bmp && is_invisible(&picture) { picture.into_rgb8().into() } else { picture };
-    let mut picture = if in_srgb { profile::to_srgb(picture, icc.as_deref()) } else { picture };
+    // A damaged profile counts as none.
+    let profile = icc.filter(|_| in_srgb).and_then(|icc| ColorProfile::new_from_slice(&icc).ok());
+    let mut picture = profile::to_srgb(picture, profile);
     picture.apply_orientation(turn.filter(|_| turned).unwrap_or(Orientation::NoTransforms));
     Ok(picture)
 }

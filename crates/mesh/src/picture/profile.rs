@@ -7,22 +7,13 @@ use rayon::prelude::*;
 /// Largest change of a channel, of 255, that is left out: the profile is sRGB's.
 const EQUAL: u8 = 1;
 
-/// A picture in sRGB. A picture stays as it is if its profile is absent, damaged, sRGB's, or for other channels, like
-/// the profile of a CMYK picture, whose pixels are converted without it.
-pub fn to_srgb(picture: DynamicImage, icc: Option<&[u8]>) -> DynamicImage {
-    match icc.map(ColorProfile::new_from_slice) {
-        Some(Ok(profile)) => from_profile(picture, &profile),
-        _ => picture,
-    }
-}
-
-/// A picture in sRGB, from a profile.
-pub fn from_profile(picture: DynamicImage, profile: &ColorProfile) -> DynamicImage {
+/// A picture in sRGB. A picture stays as it is if its profile is absent, sRGB's, or for other channels, like the profile
+/// of a CMYK picture, whose pixels are converted without it.
+pub fn to_srgb(picture: DynamicImage, profile: Option<ColorProfile>) -> DynamicImage {
     let color = picture.color();
     let (has_color, has_alpha) = (color.has_color(), color.has_alpha());
-    if profile.color_space != (if has_color { DataColorSpace::Rgb } else { DataColorSpace::Gray }) {
-        return picture;
-    }
+    let channels = if has_color { DataColorSpace::Rgb } else { DataColorSpace::Gray };
+    let Some(profile) = profile.filter(|profile| profile.color_space == channels) else { return picture };
     let [from, to] = match (has_color, has_alpha) {
         (true, false) => [Layout::Rgb; 2],
         (true, true) => [Layout::Rgba; 2],
