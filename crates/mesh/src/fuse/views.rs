@@ -172,11 +172,6 @@ impl View {
         }
     }
 
-    /// Colour and cosine of the surface at a point, if the surface is within `reach` metres of the point.
-    pub fn color(&self, place: Vec3, reach: f32) -> Option<(Vec3, f32)> {
-        self.shown(place, reach).map(|pixel| (self.color[pixel], self.facing[pixel]))
-    }
-
     /// The pixel that shows a point of the surface, within `reach` metres.
     fn shown(&self, place: Vec3, reach: f32) -> Option<usize> {
         let (pixel, z) = self.pixel(place)?;
@@ -250,9 +245,9 @@ impl Mean {
         if square <= 0.0 {
             return;
         }
-        if let Some((color, facing)) = view.color(place, reach) {
-            let weight = (square * facing).powi(SHARPNESS);
-            self.sum += weight * color;
+        if let Some(pixel) = view.shown(place, reach) {
+            let weight = (square * view.facing[pixel]).powi(SHARPNESS);
+            self.sum += weight * view.color[pixel];
             self.weight += weight;
         }
     }
