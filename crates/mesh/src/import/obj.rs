@@ -204,14 +204,10 @@ impl Statements {
                 }
             }
             for triangle in triangles(&places) {
-                let texcoords = triangle.map(|i| polygon[i].1.map(|row| row as u32));
+                let [a, b, c] = triangle.map(|i| polygon[i].1.map(|row| row as u32));
                 mesh.faces.push(Face {
                     positions: triangle.map(|i| rows[polygon[i].0]),
-                    texcoords: if let [Some(a), Some(b), Some(c)] = texcoords {
-                        Some([a, b, c])
-                    } else {
-                        None
-                    },
+                    texcoords: a.zip(b).zip(c).map(|((a, b), c)| [a, b, c]),
                     material: materials[*material],
                 });
             }
