@@ -49,15 +49,6 @@ pub struct Pieces {
     pub inside: Vec<bool>,
 }
 
-/// Counts of [`Grid::keep_one_body`].
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Kept {
-    /// Dropped pieces of the inside.
-    pub dropped: usize,
-    /// Corners of the largest dropped piece, as a share of the body's corners.
-    pub largest_dropped: f64,
-}
-
 impl Pieces {
     /// The largest piece inside, if there is one.
     pub fn body(&self) -> Option<usize> {
@@ -165,14 +156,15 @@ impl Grid {
     }
 
     /// Keeps only the largest piece inside and fills the outside that it encloses, which leaves one closed surface.
-    pub fn keep_one_body(&mut self) -> Kept {
+    /// Returns the number of dropped pieces, and the corners of the largest one as a share of the body's corners.
+    pub fn keep_one_body(&mut self) -> (usize, f64) {
         for row in 0..self.values.len() {
             if self.on_border(row) {
                 self.values[row] = self.values[row].abs().max(f32::MIN_POSITIVE);
             }
         }
         let mut pieces = self.pieces();
-        let Some(body) = pieces.body() else { return Kept::default() };
+        let Some(body) = pieces.body() else { return (0, 0.0) };
         let others = (0..pieces.sizes.len()).filter(|i| pieces.inside[*i] && *i != body);
         let dropped = others.clone().count();
         let largest = others.map(|i| pieces.sizes[i]).max().unwrap_or(0);
@@ -192,7 +184,7 @@ impl Grid {
                 *value = -value.max(f32::MIN_POSITIVE);
             }
         }
-        Kept { dropped, largest_dropped }
+        (dropped, largest_dropped)
     }
 
     /// Number of positions that [`Self::surface`] returns.
@@ -331,12 +323,12 @@ pub(super) mod tests {
     fn noise_is_closed_and_one_piece_once_one_body_is_kept() {
         let noise = |p: Vec3| (p * 977.0).dot(Vec3::new(12.9898, 78.233, 37.719)).sin();
         // Small pieces inside, then small pieces outside.
-        let Kept { dropped, .. } = grid(24, |p| noise(p) + 0.95).keep_one_body();
+        let (dropped, _) = grid(24, |p| noise(p) + 0.95).keep_one_body();
         let mut grid = grid(24, |p| noise(p) - 0.95);
         let before = grid.pieces().sizes.len();
         grid.keep_one_body();
         assert!(dropped > 10 && before > 12, "{dropped} {before}");
-        assert_eq!(grid.keep_one_body(), Kept::default());
+        assert_eq!(grid.keep_one_body(), (0, 0.0));
         assert_eq!(grid.pieces().sizes.len(), 2);
         grid.values.iter_mut().for_each(|value| *value += 0.95);
         grid.keep_one_body();
@@ -350,10 +342,9 @@ pub(super) mod tests {
         let hollow = |p: Vec3| (p.length() - 0.6).abs() - 0.15;
         let speck = |p: Vec3| (p - Vec3::splat(0.85)).length() - 0.09;
         let mut grid = grid(41, |p| hollow(p).min(speck(p)));
-        let kept = grid.keep_one_body();
-        assert_eq!(kept.dropped, 1);
+        let (dropped, largest) = grid.keep_one_body();
         // (0.09/0.75)³ without the hollow.
-        assert!((0.0005..0.005).contains(&kept.largest_dropped), "{kept:?}");
+        assert!(dropped == 1 && (0.0005..0.005).contains(&largest), "{dropped} {largest}");
         let (positions, faces) = grid.surface();
         let expected = 4.0 / 3.0 * std::f64::consts::PI * 0.75_f64.powi(3);
         assert!(is_closed(&faces) && (volume(&positions, &faces) / expected - 1.0).abs() < 0.01);
@@ -362,7 +353,7 @@ pub(super) mod tests {
     #[test]
     fn bodies_that_reach_the_border_are_closed_there() {
         let mut grid = grid(9, |_| -1.0);
-        assert_eq!(grid.keep_one_body(), Kept::default());
+        assert_eq!(grid.keep_one_body(), (0, 0.0));
         let (positions, faces) = grid.surface();
         assert!(!faces.is_empty() && is_closed(&faces));
         assert_eq!(grid.crossings(), positions.len());

@@ -22,7 +22,7 @@ use snapsnap_splat::scene::Loaded;
 use snapsnap_splat::{Gaussians, SplatError};
 
 use crate::mesh::{Mesh, bytes};
-use grid::{Grid, Kept};
+use grid::Grid;
 use views::{Mean, View, host};
 
 pub use stray::on_body;
@@ -167,7 +167,7 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     }
     let joined = grid.join_parts();
     grid.close_tunnels();
-    let Kept { dropped, largest_dropped } = grid.keep_one_body();
+    let (dropped, largest_dropped) = grid.keep_one_body();
 
     stage("surface");
     let (positions, triangles) = grid.surface();

@@ -278,11 +278,11 @@ mod tests {
             })
         };
         let mut grid = scene(&[]);
-        assert_eq!((grid.join_parts(), grid.keep_one_body().dropped), (0, 1));
+        assert_eq!((grid.join_parts(), grid.keep_one_body().0), (0, 1));
         // One foot 20 cubes below the body, the other 20 cubes beside the first.
         let (one, other) = (Vec3::new(0.0, -0.8, 0.0), Vec3::new(0.7, -0.8, 0.0));
         let mut grid = scene(&[one, other]);
-        assert_eq!((grid.join_parts(), grid.keep_one_body().dropped), (2, 1));
+        assert_eq!((grid.join_parts(), grid.keep_one_body().0), (2, 1));
         let inside = |place: Vec3, within: f32| {
             (0..grid.values.len())
                 .any(|row| grid.values[row] < 0.0 && grid.place(row).distance(place) < within)
