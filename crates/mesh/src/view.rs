@@ -331,7 +331,7 @@ impl Triangle {
                     let (sx, sy) = (px + dx, py + dy);
                     if edges.iter().all(|[a, b, c]| a * sx + b * sy + c >= 0) {
                         let at = DVec2::new(sx as f64, sy as f64) / SUBPIXELS as f64;
-                        if !(self.has_holes && shader.is_cut(self.face as usize, at, self.plane)) {
+                        if !(self.has_holes && shader.is_cut(self, at)) {
                             each(x, y, place, self.plane.dot(at.extend(1.0)));
                         }
                     }
@@ -362,7 +362,7 @@ fn shade(samples: &[(f64, u32)], corner: DVec2, shader: &Shader) -> ([f32; 3], f
         }
         let t = &shader.triangles[index as usize];
         let at = corner + middle / (f64::from(weight) * SUBPIXELS as f64);
-        color += weight as f32 * shader.color(t.face as usize, at, t.plane);
+        color += weight as f32 * shader.color(t, at);
     }
     let count = samples.len() as f32;
     ((color / count).to_array(), covered as f32 / count)

@@ -90,22 +90,21 @@ pub struct Shader<'a> {
 }
 
 impl Shader<'_> {
-    /// Colour of `face` at pixel coordinates `at`; `plane` gives 1/z there.
-    pub fn color(&self, face: usize, at: DVec2, plane: DVec3) -> Vec3 {
+    /// Colour of a triangle at pixel coordinates `at`.
+    pub(super) fn color(&self, triangle: &Triangle, at: DVec2) -> Vec3 {
         let Renderer { mesh, normals, textures, .. } = self.renderer;
-        let face = &mesh.faces[face];
+        let Triangle { plane, is_front, .. } = *triangle;
+        let face = &mesh.faces[triangle.face as usize];
         let weights = self.weights(face.positions, at, plane).as_vec3();
         let mix = |values: [Vec3; 3]| values[0] * weights.x + values[1] * weights.y + values[2] * weights.z;
         // The side towards the camera is lit.
-        let corners = face.positions.map(|row| self.corners[row as usize]);
-        let is_back = (corners[1] - corners[0]).cross(corners[2] - corners[0]).dot(corners[0]) > 0.0;
         let light = match &self.light {
             Lit::Plain(lights) => {
                 let normal = mix(face.positions.map(|row| normals[row as usize])).normalize_or_zero();
-                Vec3::splat(lights.strength(if is_back { -normal } else { normal }))
+                Vec3::splat(lights.strength(if is_front { normal } else { -normal }))
             }
             Lit::Vertices(light) => {
-                let linear = mix(face.positions.map(|row| light[row as usize][usize::from(is_back)]));
+                let linear = mix(face.positions.map(|row| light[row as usize][usize::from(!is_front)]));
                 // Colours are sRGB, about the 2.2nd root of linear light.
                 linear.min(Vec3::ONE).map(|light| libm::powf(light, 1.0 / 2.2))
             }
@@ -125,11 +124,11 @@ impl Shader<'_> {
         color
     }
 
-    /// Whether the surface of `face` is cut out at pixel coordinates `at`.
-    pub fn is_cut(&self, face: usize, at: DVec2, plane: DVec3) -> bool {
-        let face = &self.renderer.mesh.faces[face];
+    /// Whether the surface of a triangle is cut out at pixel coordinates `at`.
+    pub(super) fn is_cut(&self, triangle: &Triangle, at: DVec2) -> bool {
+        let face = &self.renderer.mesh.faces[triangle.face as usize];
         self.renderer.holes(face).is_some_and(|(opacity, rows)| {
-            let at = self.texcoord(face.positions, rows, at, plane);
+            let at = self.texcoord(face.positions, rows, at, triangle.plane);
             let texel = |at: f64, side: u32| ((at.rem_euclid(1.0) * f64::from(side)) as u32).min(side - 1);
             opacity.get_pixel(texel(at.x, opacity.width()), texel(1.0 - at.y, opacity.height()))[0] == 0
         })
