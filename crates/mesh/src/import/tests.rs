@@ -56,8 +56,7 @@ fn obj_with_several_materials_polygons_and_a_texture_path_of_another_machine() {
         "my materials.mtl",
         "newmtl skin\nKd 0.5 0.25 1\nnewmtl cloth\nKd 0 0 0\nmap_Kd -s 1 1 1 C:\\scans\\cloth 1.png\n",
     );
-    let obj = OBJ.replace("f -5//  -4// -1//", "f -5 -4 -1");
-    let mesh = read(&folder.file("a b.obj", obj)).expect("reads");
+    let mesh = read(&folder.file("a b.obj", OBJ)).expect("reads");
     let [o, x, xy, y, z] = [Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y, Vec3::Z];
     assert_eq!(corners(&mesh), [[o, x, xy], [o, xy, y], [o, x, z]]);
     assert_eq!(mesh.positions.len(), 5, "positions shared by two materials stay one");
@@ -68,13 +67,6 @@ fn obj_with_several_materials_polygons_and_a_texture_path_of_another_machine() {
     assert_eq!(material(0).color, Vec3::ONE, "a texture replaces the colour");
     assert_eq!(material(2).color, Vec3::new(0.5, 0.25, 1.0));
     assert!(material(2).texture.is_none());
-}
-
-#[test]
-fn obj_with_vertex_colours() {
-    let folder = Folder::new();
-    let mesh = read(&folder.file("a.obj", "v 0 0 0 255 0 0\nv 1 0 0 0 255 0\nv 0 1 0 0 0 51\nf 1 2 3\n"));
-    assert_eq!(mesh.expect("reads").colors, [Vec3::X, Vec3::Y, 0.2 * Vec3::Z]);
 }
 
 /// A triangle and a quadrilateral, with colours.

@@ -80,6 +80,9 @@ fn objs_of_every_writer_are_read() {
     // Some vertices have colours; the others are white.
     let mixed = "v 0 0 0\nv 1 0 0 1 0 0 0.5\nv 0 1 0\nv 5 5 5 0 0 1\nf 1 2 3\n";
     assert_eq!(read(&folder.file("b.obj", mixed)).expect("reads").colors, [Vec3::ONE, Vec3::X, Vec3::ONE]);
+    let of_255 = "v 0 0 0 255 0 0\nv 1 0 0 0 255 0\nv 0 1 0 0 0 51\nf 1 2 3\n";
+    let colors = read(&folder.file("b.obj", of_255)).expect("reads").colors;
+    assert_eq!(colors, [Vec3::X, Vec3::Y, 0.2 * Vec3::Z]);
     // A last line without an end is whole if comments count as many vertices and faces as there are.
     let counted = "# 3 vertices\n# 1 faces\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3";
     assert_eq!(read(&folder.file("c.obj", counted)).expect("reads").faces.len(), 1);
