@@ -4,8 +4,6 @@ use image::error::{DecodingError, ImageFormatHint};
 use image::{DynamicImage, ImageError, RgbImage, RgbaImage};
 use moxcms::ColorProfile;
 
-/// Bytes at the start of a file that identify its format.
-pub const START: usize = 12;
 /// Brands of still pictures in HEVC (ISO/IEC 23008-12, annex B).
 const BRANDS: [&[u8; 4]; 6] = [b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1"];
 /// Peak bytes per pixel of the decoder: 13, measured on a picture of 12 million pixels, plus a reserve.
@@ -15,7 +13,7 @@ const MAX_PIXELS_PER_BYTE: u64 = 1 << 15;
 
 /// Whether a file begins as a HEIC does.
 pub fn is_heic(start: &[u8]) -> bool {
-    start.len() >= START && &start[4..8] == b"ftyp" && BRANDS.iter().any(|brand| start[8..START] == **brand)
+    start.len() >= 12 && &start[4..8] == b"ftyp" && BRANDS.iter().any(|brand| start[8..12] == **brand)
 }
 
 fn damaged(message: impl ToString) -> ImageError {

@@ -277,19 +277,12 @@ fn light_is_never_clipped_and_the_nearer_surface_is_visible_from_both_sides() {
     assert!(nothing.alpha.iter().all(|a| *a == 0.0) && nothing.depth.iter().all(|d| *d == 0.0));
 }
 
-/// A floor of 2 m under a ball of radius 0.3 m, whose middle is 0.6 m above it.
-fn ball_over_a_floor() -> Mesh {
-    let side = 80_u32;
-    let at = |i: u32| 2.0 * i as f32 / side as f32 - 1.0;
-    let rows = 0..=side;
-    let positions: Vec<Vec3> =
-        rows.clone().flat_map(|x| rows.clone().map(move |z| Vec3::new(at(x), 0.0, at(z)))).collect();
-    joined(mesh(positions, &cells(side)), &sphere(Vec3::new(0.0, 0.6, 0.0), 0.3, 4))
-}
-
 #[test]
 fn a_ball_shades_the_floor_on_the_side_away_from_the_lamp() {
-    let mesh = ball_over_a_floor();
+    // A floor of 2 m under a ball of radius 0.3 m, whose middle is 0.6 m above it.
+    let at = |i: u32| i as f32 / 40.0 - 1.0;
+    let floor = (0..=80).flat_map(|x| (0..=80).map(move |z| Vec3::new(at(x), 0.0, at(z)))).collect();
+    let mesh = joined(mesh(floor, &cells(80)), &sphere(Vec3::new(0.0, 0.6, 0.0), 0.3, 4));
     let renderer = Renderer::new(&mesh).expect("a mesh");
     let lamp = Lamp { direction: Vec3::new(-1.0, 1.0, 0.0), color: Vec3::ONE, radius: 0.2 };
     let surroundings = Surroundings::new(vec![lamp], [Vec3::ONE; 2], 6.0);
