@@ -133,7 +133,10 @@ pub struct Fused {
 pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fused, FuseError> {
     let (centre, size) = body(&scene.gaussians)?;
     // The surface is computed around the origin, where f32 is finest.
-    let scene = centred(scene, centre);
+    let mut scene = scene.clone();
+    let means = scene.gaussians.means.clone();
+    let origin = Tensor::<1>::from_floats(centre.to_array(), &means.device());
+    scene.gaussians.means = means - origin.unsqueeze::<2>();
     let mut grid = Grid::around(size, TRUNCATION + 2.0);
     let Grid { cell, counts, .. } = grid;
 
@@ -188,15 +191,6 @@ pub fn fuse(scene: &Loaded, options: Options, stage: &dyn Fn(&str)) -> Result<Fu
     }
     mesh.positions.iter_mut().for_each(|place| *place += centre);
     Ok(Fused { mesh, joined, dropped, largest_dropped, faces })
-}
-
-/// The Gaussians with `centre` at the origin.
-fn centred(scene: &Loaded, centre: Vec3) -> Loaded {
-    let mut scene = scene.clone();
-    let means = scene.gaussians.means.clone();
-    let centre = Tensor::<1>::from_floats(centre.to_array(), &means.device());
-    scene.gaussians.means = means - centre.unsqueeze::<2>();
-    scene
 }
 
 /// Replaces the vertex colours by a texture. Texels that no view shows get the interpolated vertex colour. The body
