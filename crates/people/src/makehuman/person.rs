@@ -109,7 +109,7 @@ impl<'a> Person<'a> {
         };
         let cloth = 0.01 + outfit.top_thickness + if outfit.breadth() > 0.0 { 0.03 } else { 0.0 };
         let sunk = |(vertices, _): &(Vec<Vertex>, Vec<Placed>)| {
-            rig::sunk_hands(&group(library, vertices, "body"), cloth)
+            rig::sunk_hands(&Patch::of(vertices, &library.groups["body"]), cloth)
         };
         let (vertices, placed) = pose.free_hands(posed, sunk);
 
@@ -122,7 +122,7 @@ impl<'a> Person<'a> {
             detail,
             marks: Marks::of(&figure, &outfit),
             rows,
-            tights: group(library, &vertices, "helper-tights").subdivided(detail.steps(2)),
+            tights: Patch::of(&vertices, &library.groups["helper-tights"]).subdivided(detail.steps(2)),
             placed,
             head: joints.row("head").unwrap_or(0),
             worn,
@@ -145,8 +145,9 @@ impl<'a> Person<'a> {
         bones.map(bone).collect()
     }
 
+    /// A group of the base mesh.
     pub fn group(&self, name: &str) -> Patch {
-        group(self.library, &self.vertices, name)
+        Patch::of(&self.vertices, &self.library.groups[name])
     }
 
     /// Position of a vertex on the chart of a part, which is an index into [`ORDER`].
@@ -178,11 +179,6 @@ fn landmarks(head: &Part, joints: &Joints) -> Landmarks {
         lips: [corner.0 * 1.15, (high.y - low.y) / head.length * 0.3],
         painted: false,
     }
-}
-
-/// A group of the base mesh.
-fn group(library: &Library, vertices: &[Vertex], name: &str) -> Patch {
-    Patch::of(vertices, &library.groups[name])
 }
 
 /// Share of each part of the body in each vertex.
