@@ -93,23 +93,17 @@ fn necks(triangles: &[[u32; 3]], positions: usize, reduced: &Manifold) -> Option
             owner[row] = piece;
         }
     }
-    let mut front = owner.clone();
     loop {
-        let mut grew = false;
+        let before = owner.clone();
         for triangle in triangles.iter().map(|t| t.map(|row| row as usize)) {
-            let Some(known) = triangle.iter().map(|row| owner[*row]).find(|owner| *owner != usize::MAX)
-            else {
-                continue;
-            };
-            for row in triangle.into_iter().filter(|row| owner[*row] == usize::MAX) {
-                front[row] = known;
-                grew = true;
+            let is_known = |row: &usize| before[*row] != usize::MAX;
+            if let Some(known) = triangle.iter().find(|row| is_known(row)) {
+                triangle.iter().filter(|row| !is_known(row)).for_each(|row| owner[*row] = before[*known]);
             }
         }
-        if !grew {
+        if owner == before {
             break;
         }
-        owner.clone_from(&front);
     }
     for triangle in triangles.iter().map(|t| t.map(|row| row as usize)) {
         if triangle.iter().any(|row| owner[*row] != owner[triangle[0]]) {
