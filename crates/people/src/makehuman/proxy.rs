@@ -38,8 +38,7 @@ const MAX_SCALE: f32 = 10.0;
 /// Binding of a vertex: a weighted sum of base mesh vertices, and an offset in metres before scaling.
 #[derive(Debug, Clone, Copy)]
 struct Binding {
-    rows: [u32; 3],
-    shares: [f32; 3],
+    shares: [(u32, f32); 3],
     offset: Vec3,
 }
 
@@ -209,17 +208,16 @@ impl Proxy {
         };
         let scale = Vec3::new(scale(0), scale(1), scale(2));
         let vertex = |binding: &Binding| {
-            let shares: Vec<(u32, f32)> = binding.rows.into_iter().zip(binding.shares).collect();
             let at = |(row, share): &(u32, f32)| *share * body[*row as usize].rest;
-            let rest = shares.iter().map(at).sum::<Vec3>() + binding.offset * scale;
+            let rest = binding.shares.iter().map(at).sum::<Vec3>() + binding.offset * scale;
             // Negative shares lie beyond the triangle; bones follow the triangle's corners.
-            let kept: Vec<(u32, f32)> = shares.iter().map(|(row, share)| (*row, share.max(0.0))).collect();
+            let mut kept = binding.shares.map(|(row, share)| (row, share.max(0.0)));
             let sum: f32 = kept.iter().map(|(_, share)| share).sum();
-            let kept: Vec<(u32, f32)> = if sum > 0.0 {
-                kept.into_iter().map(|(row, share)| (row, share / sum)).collect()
+            if sum > 0.0 {
+                kept.iter_mut().for_each(|(_, share)| *share /= sum);
             } else {
-                vec![(binding.rows[0], 1.0)]
-            };
+                kept[0].1 = 1.0;
+            }
             let parts = std::array::from_fn(|part| {
                 kept.iter().map(|(row, share)| share * body[*row as usize].parts[part]).sum()
             });
@@ -258,14 +256,14 @@ fn binding(line: &str, vertices: usize) -> Option<Binding> {
     let inside = |row: &u32| (*row as usize) < vertices;
     if words.clone().count() == 1 {
         let [row] = numbers(&mut words).filter(|rows: &[u32; 1]| rows.iter().all(inside))?;
-        return Some(Binding { rows: [row; 3], shares: [1.0, 0.0, 0.0], offset: Vec3::ZERO });
+        return Some(Binding { shares: [(row, 1.0), (row, 0.0), (row, 0.0)], offset: Vec3::ZERO });
     }
     let rows = numbers(&mut words).filter(|rows: &[u32; 3]| rows.iter().all(inside))?;
     let shares: [f32; 3] = numbers(&mut words)?;
     if !shares.iter().all(|share| share.abs() < 100.0) {
         return None;
     }
-    Some(Binding { rows, shares, offset: vector(words)? })
+    Some(Binding { shares: [0, 1, 2].map(|i| (rows[i], shares[i])), offset: vector(words)? })
 }
 
 /// Marks the vertices of a line such as `1355 - 1388 1393`.
