@@ -107,7 +107,7 @@ pub fn read_rigged(path: &Path) -> Result<Rigged, FileError> {
         path,
         blob,
         rigged: Rigged::default(),
-        textures: Textures::new(),
+        textures: Textures::default(),
         nodes_left: document.nodes().len(),
         places: Vec::new(),
         shown: HashSet::new(),

@@ -121,17 +121,14 @@ fn triangles(corners: &[Vec3]) -> Vec<[usize; 3]> {
 }
 
 /// Textures of one scan, each decoded once.
+#[derive(Default)]
 struct Textures<K> {
     loaded: HashMap<K, Arc<RgbImage>>,
-    /// Bytes that further textures may take.
-    left: u64,
+    /// Bytes that the textures take.
+    taken: u64,
 }
 
 impl<K: Eq + Hash> Textures<K> {
-    fn new() -> Self {
-        Self { loaded: HashMap::new(), left: MAX_TEXTURES }
-    }
-
     /// The texture with this key. `decode` is called at the first use and receives the memory limit in bytes.
     fn load(
         &mut self,
@@ -141,15 +138,16 @@ impl<K: Eq + Hash> Textures<K> {
         if let Some(texture) = self.loaded.get(&key) {
             return Ok(texture.clone());
         }
-        let texture = match decode(MAX_TEXTURE.min(self.left)) {
-            Err(FileError::Unsuitable { path, message }) if self.left < MAX_TEXTURE => {
+        let left = MAX_TEXTURES.saturating_sub(self.taken);
+        let texture = match decode(MAX_TEXTURE.min(left)) {
+            Err(FileError::Unsuitable { path, message }) if left < MAX_TEXTURE => {
                 let all = MAX_TEXTURES >> 20;
                 let message = format!("{message} (all textures of a scan together may take {all} MiB)");
                 return Err(FileError::Unsuitable { path, message });
             }
             decoded => Arc::new(decoded?.into_rgb8()),
         };
-        self.left = self.left.saturating_sub(texture.len() as u64);
+        self.taken += texture.len() as u64;
         self.loaded.insert(key, texture.clone());
         Ok(texture)
     }

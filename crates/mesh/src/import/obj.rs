@@ -149,7 +149,7 @@ impl Statements {
                 }
             }
         }
-        let (mut known, mut textures) = (Vec::new(), Textures::new());
+        let (mut known, mut textures) = (Vec::new(), Textures::default());
         for file in files {
             for Described { name, color, texture, opacity } in read_materials(&file)? {
                 let texture = texture.map(|statement| textures.beside(path, file_name(&statement)));

@@ -24,7 +24,7 @@ pub fn read(path: &Path) -> Result<Mesh, FileError> {
     let header = parse(&bytes).map_err(wrong)?;
     let mut body = Body::new(&bytes[header.len..], header.format);
     let mut mesh = Mesh::default();
-    let mut textures = Textures::new();
+    let mut textures = Textures::default();
     for name in header.comments.iter().filter_map(|comment| comment.strip_prefix("TextureFile")) {
         let texture = Some(textures.beside(path, name.trim())?);
         mesh.materials.push(Material { texture, ..Material::default() });
