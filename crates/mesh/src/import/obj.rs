@@ -317,12 +317,9 @@ fn file_name(statement: &str) -> &str {
     while rest.starts_with('-') {
         let (option, values) = first_word(rest);
         // The values of an option are numbers or one word (on, off, a channel).
-        if option == "-imfchan" || !is_number(values) {
-            rest = first_word(values).1;
-            continue;
-        }
-        rest = values;
-        while is_number(rest) {
+        let has_numbers = option != "-imfchan" && is_number(values);
+        rest = first_word(values).1;
+        while has_numbers && is_number(rest) {
             rest = first_word(rest).1;
         }
     }

@@ -27,7 +27,7 @@ impl File<'_> {
                 return Ok(Vec::new());
             }
             let accessor = skin.inverse_bind_matrices();
-            let count = accessor.as_ref().map(gltf::Accessor::count);
+            let default = accessor.is_none().then_some(Mat4::IDENTITY);
             self.check("inverse bind matrices", accessor, &[DataType::F32], &[Dimensions::Mat4])?;
             let reader = skin.reader(|_| Some(&self.blob));
             let inverse = reader.read_inverse_bind_matrices().into_iter().flatten();
@@ -36,14 +36,9 @@ impl File<'_> {
                 let row = *rows.get(&joint.index()).ok_or_else(|| {
                     self.wrong(format!("joint {place} of skin {index} is not in the scene"))
                 })?;
-                let inverse = match inverse.get(place) {
-                    Some(inverse) => *inverse,
-                    None if count.is_none() => Mat4::IDENTITY,
-                    None => {
-                        let message = format!("skin {index} has no inverse bind matrix for joint {place}");
-                        return Err(self.wrong(message));
-                    }
-                };
+                let missing =
+                    || self.wrong(format!("skin {index} has no inverse bind matrix for joint {place}"));
+                let inverse = inverse.get(place).copied().or(default).ok_or_else(missing)?;
                 let matrix = self.worlds[row].1 * inverse;
                 if !matrix.is_finite() {
                     return Err(self.wrong(format!("joint {place} of skin {index} is not finite")));
