@@ -79,7 +79,7 @@ fn is_whole(bytes: &[u8]) -> bool {
     // A marker follows 0xFF and optional padding with 0xFF. 0 after 0xFF means coded data.
     let is_marker = |pair: &[u8]| pair[0] == 0xff && pair[1] != 0 && pair[1] != 0xff;
     // The length of the segment follows most markers.
-    while let Some(found) = bytes[at..].windows(2).position(is_marker) {
+    while let Some(found) = bytes.get(at..).and_then(|left| left.windows(2).position(is_marker)) {
         let marker = bytes[at + found + 1];
         at += found + 2;
         match marker {
@@ -90,9 +90,6 @@ fn is_whole(bytes: &[u8]) -> bool {
                 let Some(length) = bytes.get(at..at + 2) else { return false };
                 at += usize::from(u16::from_be_bytes([length[0], length[1]]));
             }
-        }
-        if at > bytes.len() {
-            return false;
         }
     }
     false
