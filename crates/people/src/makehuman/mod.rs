@@ -81,9 +81,7 @@ impl Person<'_> {
         };
         let skirts: Vec<Piece> = self.drapes().map(skirt).collect();
         let mut pieces = vec![self.pressed_skin(skin, &garments)];
-        pieces.extend(hair);
-        pieces.extend(garments);
-        pieces.extend(skirts);
+        pieces.extend(hair.into_iter().chain(garments).chain(skirts));
 
         let mut surface = Surface { positions: Vec::new(), faces: Vec::new(), parts: Vec::new() };
         let mut positions = Vec::new();

@@ -176,10 +176,8 @@ impl Proxy {
                 "x_scale" | "y_scale" | "z_scale" => {
                     let rows: [u32; 2] =
                         numbers(&mut words).filter(|rows| rows.iter().all(inside)).ok_or_else(bad)?;
-                    let [length]: [f32; 1] = numbers(&mut words).ok_or_else(bad)?;
-                    if !(length > 0.0 && length.is_finite()) {
-                        return Err(bad());
-                    }
+                    let length = numbers(&mut words).filter(|[l]: &[f32; 1]| *l > 0.0 && l.is_finite());
+                    let [length] = length.ok_or_else(bad)?;
                     let axis = usize::from(first.as_bytes()[0] - b'x');
                     proxy.scales[axis] = Some((rows, METRES * length));
                 }
@@ -259,10 +257,8 @@ fn binding(line: &str, vertices: usize) -> Option<Binding> {
         return Some(Binding { shares: [(row, 1.0), (row, 0.0), (row, 0.0)], offset: Vec3::ZERO });
     }
     let rows = numbers(&mut words).filter(|rows: &[u32; 3]| rows.iter().all(inside))?;
-    let shares: [f32; 3] = numbers(&mut words)?;
-    if !shares.iter().all(|share| share.abs() < 100.0) {
-        return None;
-    }
+    let is_small = |shares: &[f32; 3]| shares.iter().all(|share| share.abs() < 100.0);
+    let shares = numbers(&mut words).filter(is_small)?;
     Some(Binding { shares: [0, 1, 2].map(|i| (rows[i], shares[i])), offset: vector(words)? })
 }
 
