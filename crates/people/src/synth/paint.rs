@@ -192,11 +192,9 @@ impl<'a> Painter<'a> {
             let parted = (up - face.mouth).abs() < 0.004;
             color = if parted { *lips * 0.45 } else { *lips };
         }
-        if face.painted {
-            let nostril = Vec2::new((aside - 0.075) / 0.03, (up - 0.3) / 0.013);
-            if nostril.length() < 1.0 {
-                color *= 0.5;
-            }
+        let nostril = Vec2::new((aside - 0.075) / 0.03, (up - 0.3) / 0.013);
+        if face.painted && nostril.length() < 1.0 {
+            color *= 0.5;
         }
         let brow =
             Vec2::new((aside - eye_angle) / 0.22, (up - face.brow - 0.02 * (aside - eye_angle)) / 0.017);
