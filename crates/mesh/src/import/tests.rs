@@ -3,7 +3,7 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use glam::{Vec2, Vec3};
-use image::{ImageFormat, Rgb, RgbImage};
+use image::{DynamicImage, ImageFormat, Rgb, RgbImage};
 
 use super::{read, triangles};
 use crate::mesh::Mesh;
@@ -11,15 +11,16 @@ use crate::view::{Renderer, ViewOptions};
 
 mod odd;
 
+fn as_png(picture: impl Into<DynamicImage>) -> Vec<u8> {
+    let mut bytes = Cursor::new(Vec::new());
+    picture.into().write_to(&mut bytes, ImageFormat::Png).expect("encodes");
+    bytes.into_inner()
+}
+
 /// A picture with one pixel of each of four colours, as PNG.
 fn png() -> Vec<u8> {
-    let mut picture = RgbImage::new(2, 2);
-    for (x, y, color) in [(0, 0, [255, 0, 0]), (1, 0, [0, 255, 0]), (0, 1, [0, 0, 255]), (1, 1, [9, 9, 9])] {
-        picture.put_pixel(x, y, Rgb(color));
-    }
-    let mut bytes = Cursor::new(Vec::new());
-    picture.write_to(&mut bytes, ImageFormat::Png).expect("encodes");
-    bytes.into_inner()
+    let colors = [[255, 0, 0], [0, 255, 0], [0, 0, 255], [9, 9, 9]];
+    as_png(RgbImage::from_fn(2, 2, |x, y| Rgb(colors[(x + 2 * y) as usize])))
 }
 
 struct Folder(tempfile::TempDir);

@@ -61,16 +61,11 @@ fn objs_of_every_writer_are_read() {
     assert!(a.opacity.is_none() && b.opacity.is_none());
 
     // Hair cards: the picture of `map_d` cuts them out by its alpha, or else by its brightness.
-    let bytes = |picture: image::DynamicImage| {
-        let mut png = Cursor::new(Vec::new());
-        picture.write_to(&mut png, ImageFormat::Png).expect("a picture");
-        png.into_inner()
-    };
     let half = |x: u32| if x == 0 { 40 } else { 200 };
     let grey = image::GrayImage::from_fn(2, 1, |x, _| image::Luma([half(x)]));
     let clear = RgbaImage::from_fn(2, 1, |x, _| image::Rgba([255, 255, 255, half(x)]));
-    for (name, picture) in [("grey.png", grey.into()), ("clear.png", clear.into())] {
-        folder.file(name, bytes(picture));
+    for (name, picture) in [("grey.png", as_png(grey)), ("clear.png", as_png(clear))] {
+        folder.file(name, picture);
         folder.file("b.mtl", format!("newmtl b\nmap_kd skin.png\nmap_d -imfchan m {name}\n"));
         let mesh = read(&folder.file("a.obj", format!("{start}{faces}"))).expect("reads");
         let hair = &mesh.materials[mesh.faces[1].material as usize];
@@ -227,12 +222,10 @@ fn glbs_of_every_writer_are_read() {
 #[test]
 fn surfaces_are_cut_out_where_their_texture_has_no_opacity() {
     let folder = Folder::new();
-    let mut picture = Cursor::new(Vec::new());
     // The left half is solid.
     let texel = |x: u32, _: u32| image::Rgba([255, 255, 255, if x < 4 { 255 } else { 60 }]);
-    RgbaImage::from_fn(8, 8, texel).write_to(&mut picture, ImageFormat::Png).expect("encodes");
-    let uri =
-        format!(r#"{{"uri":"data:image/png;base64,{}"}}"#, BASE64_STANDARD.encode(picture.into_inner()));
+    let picture = BASE64_STANDARD.encode(as_png(RgbaImage::from_fn(8, 8, texel)));
+    let uri = format!(r#"{{"uri":"data:image/png;base64,{picture}"}}"#);
     let coverage = |mode: &str| {
         let bytes = glb(|json| {
             json.replace(PICTURE, &uri).replace(r#""materials":[{"#, &format!(r#""materials":[{{{mode}"#))
