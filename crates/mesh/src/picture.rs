@@ -58,7 +58,7 @@ pub fn size(path: &Path, bytes: Option<&[u8]>) -> Result<[u32; 2], FileError> {
 }
 
 fn size_from(path: &Path, mut source: impl BufRead + Seek) -> Result<[u32; 2], FileError> {
-    if heic::is_heic(start(path, &mut source)?) {
+    if heic::is_heic(source.fill_buf().map_err(FileError::read(path))?) {
         return Ok(heic::size(&whole(path, source)?).map_err(unreadable(path))?.0);
     }
     let reader = ImageReader::new(source).with_guessed_format().map_err(FileError::read(path))?;
@@ -77,11 +77,6 @@ pub fn decode_bytes(path: &Path, bytes: &[u8], most: u64) -> Result<DynamicImage
 /// For `map_err`: the error for an image in `path` that is damaged or of an unknown format.
 pub fn unreadable(path: &Path) -> impl Fn(ImageError) -> FileError {
     move |source| FileError::unsuitable(path, format!("not a readable image: {source}"))
-}
-
-/// The first bytes of a file, without consuming them.
-fn start<'a>(path: &Path, source: &'a mut impl BufRead) -> Result<&'a [u8], FileError> {
-    source.fill_buf().map_err(FileError::read(path))
 }
 
 /// The bytes of a file, up to [`MAX_FILE`].
@@ -110,7 +105,7 @@ fn decode_from(
             format!("is {width}×{height}, {mega} MiB in memory, more than {most}: make the picture smaller");
         Err(FileError::unsuitable(path, message))
     };
-    if heic::is_heic(start(path, &mut source)?) {
+    if heic::is_heic(source.fill_buf().map_err(FileError::read(path))?) {
         let bytes = whole(path, source)?;
         let (size, needed) = heic::size(&bytes).map_err(&failed)?;
         check(size, needed)?;
