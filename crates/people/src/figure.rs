@@ -229,11 +229,8 @@ pub struct Bone {
 }
 
 impl Bone {
-    fn hang(start: Vec3, frame: Mat3, length: f32) -> Self {
-        Self { start, end: start - frame.y_axis * length, frame }
-    }
-
-    fn stand(start: Vec3, frame: Mat3, length: f32) -> Self {
+    /// A bone that stands on `start`, or hangs from it if its length is negative.
+    fn upright(start: Vec3, frame: Mat3, length: f32) -> Self {
         Self { start, end: start + frame.y_axis * length, frame }
     }
 
@@ -289,11 +286,11 @@ impl Figure {
         let h = build.stature;
         let turn = pose.trunk[1];
         let (pelvis_frame, chest_frame) = (pose.trunk_frame(0.0), pose.trunk_frame(1.0));
-        let pelvis = Bone::stand(Vec3::ZERO, pelvis_frame, 0.095 * h);
-        let chest = Bone::stand(pelvis.end, chest_frame, 0.215 * h);
+        let pelvis = Bone::upright(Vec3::ZERO, pelvis_frame, 0.095 * h);
+        let chest = Bone::upright(pelvis.end, chest_frame, 0.215 * h);
         let neck_frame = chest_frame * rotate_x(0.4 * pose.head[0] + pose.spine[2] + 8.0);
-        let neck = Bone::stand(chest.end, neck_frame, 0.045 * h);
-        let head = Bone::stand(neck.end, pose.head_frame(1.0), 0.128 * h * build.head);
+        let neck = Bone::upright(chest.end, neck_frame, 0.045 * h);
+        let head = Bone::upright(neck.end, pose.head_frame(1.0), 0.128 * h * build.head);
 
         let breadth = h * build.shoulders * (0.09 + 0.015 * build.sex);
         let sides = [0, 1];
@@ -304,16 +301,16 @@ impl Figure {
                 * rotate_x(-raise)
                 * rotate_z(sign(side) * abduct)
                 * rotate_y(-sign(side) * inwards);
-            Bone::hang(start, frame, 0.172 * h * build.arms)
+            Bone::upright(start, frame, -0.172 * h * build.arms)
         });
         let forearms = sides.map(|side| {
             let frame = upper_arms[side].frame * rotate_x(-pose.arms[side][3]);
-            Bone::hang(upper_arms[side].end, frame, 0.146 * h * build.arms)
+            Bone::upright(upper_arms[side].end, frame, -0.146 * h * build.arms)
         });
         let hands = sides.map(|side| {
             // Palms towards the thighs.
             let frame = forearms[side].frame * rotate_y(-sign(side) * 70.0) * rotate_x(-8.0);
-            Bone::hang(forearms[side].end, frame, 0.1 * h)
+            Bone::upright(forearms[side].end, frame, -0.1 * h)
         });
 
         let thighs = sides.map(|side| {
@@ -321,11 +318,11 @@ impl Figure {
             let start = pelvis.at(0.0, Vec3::new(sign(side) * 0.051 * h, -0.005 * h, 0.0));
             let out = sign(side) * 0.5 * pose.toes[side];
             let frame = pelvis_frame * rotate_x(-forward) * rotate_z(sign(side) * apart) * rotate_y(out);
-            Bone::hang(start, frame, 0.245 * h * build.legs)
+            Bone::upright(start, frame, -0.245 * h * build.legs)
         });
         let calves = sides.map(|side| {
             let frame = thighs[side].frame * rotate_x(pose.legs[side][2]);
-            Bone::hang(thighs[side].end, frame, 0.246 * h * build.legs)
+            Bone::upright(thighs[side].end, frame, -0.246 * h * build.legs)
         });
         let feet = sides.map(|side| {
             // Feet stay flat. The heel lifts only if the calf leans far forwards.
@@ -333,7 +330,7 @@ impl Figure {
             let lifted = (calf.y_axis.z.clamp(-1.0, 1.0) * 45.0 - 6.0).max(0.0);
             let out = sign(side) * (9.0 + pose.toes[side]);
             let frame = rotate_y(0.3 * turn + out) * rotate_x(lifted);
-            Bone::hang(calves[side].end, frame, 0.039 * h)
+            Bone::upright(calves[side].end, frame, -0.039 * h)
         });
         let fingers = pose.fingers;
         Self { build, fingers, pelvis, chest, neck, head, upper_arms, forearms, hands, thighs, calves, feet }
