@@ -219,12 +219,10 @@ impl Print {
                     2 => 0.5 / (p.x.abs().max(p.y.abs()) / r.max(1e-6)) * 0.8,
                     _ => 0.3 + 0.18 * libm::sincosf(3.0 * angle).1,
                 };
-                if r < 0.5 * edge {
-                    second
-                } else if r < edge {
-                    first
-                } else {
-                    color
+                match r {
+                    r if r < 0.5 * edge => second,
+                    r if r < edge => first,
+                    _ => color,
                 }
             }
         }
