@@ -2,7 +2,7 @@
 //! below a skirt or a hand beyond a cuff. Narrow tunnels through the body are closed, such as a hole between the shells of
 //! a shoulder: a dilation fills them; it is thinned from outside inwards, and only the walls across tunnels are kept of it.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::LazyLock;
 
 use glam::I64Vec3;
@@ -64,16 +64,10 @@ impl Grid {
         // Breadth-first search: the predecessor of every corner on the path from the body.
         let mut from = vec![NOWHERE; pieces.of.len()];
         let mut front = VecDeque::new();
-        let mut rows: HashMap<usize, Vec<usize>> = HashMap::new();
-        for (row, number) in pieces.of.iter().map(|number| *number as usize).enumerate() {
-            if waits[number] || number == body {
-                rows.entry(number).or_default().push(row);
-            }
-        }
         let begin = |number: usize, from: &mut [u32], front: &mut VecDeque<(usize, usize)>| {
-            for row in &rows[&number] {
-                from[*row] = *row as u32;
-                front.push_back((*row, 0));
+            for row in (0..from.len()).filter(|row| pieces.of[*row] as usize == number) {
+                from[row] = row as u32;
+                front.push_back((row, 0));
             }
         };
         begin(body, &mut from, &mut front);
