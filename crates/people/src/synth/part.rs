@@ -220,8 +220,7 @@ impl Part {
 
     /// Distance to the part's surface, clothes included.
     pub fn distance(&self, p: Vec3) -> f32 {
-        let skin = if self.drape.is_none() { self.skin(p) } else { 0.0 };
-        self.dressed(p, skin)
+        self.dressed(p, self.skin(p))
     }
 
     /// Largest thickness of the part's cloth, metres.
