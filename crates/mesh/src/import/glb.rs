@@ -14,7 +14,7 @@ use snapsnap_base::{FileError, file};
 
 use super::glb_material::{base, check_extensions, is_invisible, of_uri, shown, texture_set, transformed};
 use super::skin::moved;
-use super::{MAX_BYTES, Textures, add_colors};
+use super::{MAX_BYTES, Textures};
 use crate::mesh::{Face, Material, Mesh};
 
 /// Deepest nesting of nodes.
@@ -274,7 +274,12 @@ impl File<'_> {
         }
         mesh.positions.extend(positions);
         mesh.texcoords.extend(texcoords);
-        add_colors(mesh, first as usize, colors.into_iter());
+        // If some positions have a colour, the others are white.
+        if !colors.is_empty() || !mesh.colors.is_empty() {
+            mesh.colors.resize(first as usize, Vec3::ONE);
+            mesh.colors.extend(colors);
+            mesh.colors.resize(mesh.positions.len(), Vec3::ONE);
+        }
         self.rigged.weights.extend(weights);
         Ok(())
     }

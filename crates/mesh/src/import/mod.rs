@@ -73,15 +73,6 @@ fn finish(mesh: &mut Mesh, path: &Path) -> Result<Vec<usize>, FileError> {
     Ok(mesh.weld())
 }
 
-/// Adds the vertex colours from index `first` on. If some vertices have a colour, the others become white.
-fn add_colors(mesh: &mut Mesh, first: usize, colors: impl ExactSizeIterator<Item = Vec3>) {
-    if colors.len() > 0 || !mesh.colors.is_empty() {
-        mesh.colors.resize(first, Vec3::ONE);
-        mesh.colors.extend(colors);
-        mesh.colors.resize(mesh.positions.len(), Vec3::ONE);
-    }
-}
-
 /// Triangles of a polygon, as places in `corners`. A concave polygon is cut into ears, so that its gaps stay open.
 fn triangles(corners: &[Vec3]) -> Vec<[usize; 3]> {
     /// Most corners of a polygon that is cut into ears, which takes their third power.
