@@ -114,11 +114,9 @@ impl Person<'_> {
     /// Distance of trousers from the body, metres.
     fn off_bottom(&self, vertex: &Vertex) -> f32 {
         let at = self.place(vertex);
+        let down = (at.along / at.length).clamp(0.0, 1.0);
         let flare = match (at.kind, self.outfit.lower) {
-            (Kind::Leg, Lower::Trousers { flare, .. }) => {
-                let down = (at.along / at.length).clamp(0.0, 1.0);
-                flare * down * down
-            }
+            (Kind::Leg, Lower::Trousers { flare, .. }) => flare * down * down,
             _ => 0.0,
         };
         0.001 + 0.5 * self.outfit.lower_thickness + flare + self.folds(vertex)
@@ -143,12 +141,9 @@ impl Person<'_> {
             let share = (at.along / (self.outfit.sleeve * at.length).max(0.05)).clamp(0.0, 1.0);
             let flare = if at.kind == Kind::Arm { self.outfit.sleeve_flare * share * share } else { 0.0 };
             // Collars lie close to the neck.
-            let loose = if at.kind == Kind::Trunk {
-                let collar = self.marks.collar(at.angle);
-                1.0 - smoothstep(collar - 0.09, collar - 0.02, at.along)
-            } else {
-                1.0
-            };
+            let collar = self.marks.collar(at.angle);
+            let close = smoothstep(collar - 0.09, collar - 0.02, at.along);
+            let loose = if at.kind == Kind::Trunk { 1.0 - close } else { 1.0 };
             let off = 0.006 + loose * (0.8 * self.outfit.top_thickness + flare + 1.5 * self.folds(vertex));
             // The top hangs over the trousers.
             let over = smoothstep(-0.03, 0.0, self.in_bottom(vertex));
