@@ -56,11 +56,14 @@ pub fn rigged(
 ) -> Result<(Mesh, Vec<Bone>), FileError> {
     let person = Person::of(library, name, poses, pose, detail)?;
     let mut mesh = person.mesh();
-    let mut bones = person.bones();
-    let floor = mesh.bounds().0.y;
-    bones.iter_mut().for_each(|bone| bone.place.y -= floor);
+    let floor = mesh.bounds().0.y * Vec3::Y;
+    let bones = library.bones.iter().zip(&person.placed).map(|(bone, placed)| Bone {
+        name: bone.name.clone(),
+        parent: bone.parent,
+        place: placed.head - floor,
+    });
     stand(&mut mesh);
-    Ok((mesh, bones))
+    Ok((mesh, bones.collect()))
 }
 
 impl Person<'_> {

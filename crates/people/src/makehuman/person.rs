@@ -2,10 +2,9 @@
 
 use glam::Vec3;
 use snapsnap_base::{FileError, random};
-use snapsnap_mesh::import;
 use snapsnap_mesh::mesh::bounds;
 
-use super::files::{Library, RigBone};
+use super::files::Library;
 use super::morph::{Mix, morph};
 use super::patch::{HEAD, ORDER, PARTS, Patch, Vertex};
 use super::proxy::Worn;
@@ -132,17 +131,6 @@ impl<'a> Person<'a> {
             body,
             vertices,
         })
-    }
-
-    /// The bones in the person's pose.
-    pub fn bones(&self) -> Vec<import::Bone> {
-        let bones = self.library.bones.iter().zip(&self.placed);
-        let bone = |(bone, placed): (&RigBone, &Placed)| import::Bone {
-            name: bone.name.clone(),
-            parent: bone.parent,
-            place: placed.head,
-        };
-        bones.map(bone).collect()
     }
 
     /// A group of the base mesh.
