@@ -62,8 +62,7 @@ fn size_from(path: &Path, mut source: impl BufRead + Seek) -> Result<[u32; 2], F
         return Ok(heic::size(&whole(path, source)?).map_err(unreadable(path))?.0);
     }
     let reader = ImageReader::new(source).with_guessed_format().map_err(FileError::read(path))?;
-    let size = reader.into_dimensions();
-    size.map(Into::into).map_err(unreadable(path))
+    reader.into_dimensions().map(Into::into).map_err(unreadable(path))
 }
 
 /// The picture in `bytes`, whose EXIF data do not turn it: a texture of `path`, which errors name.
