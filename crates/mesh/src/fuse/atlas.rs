@@ -176,8 +176,7 @@ fn pack(charts: &[Chart], side: i32) -> Option<Vec<IVec2>> {
     for i in order {
         let size = size(&charts[i]);
         if at.x + size.x > side {
-            at = IVec2::new(0, at.y + shelf);
-            shelf = 0;
+            (at, shelf) = (IVec2::new(0, at.y + shelf), 0);
         }
         shelf = shelf.max(size.y);
         if size.x > side || at.y + shelf > side {
