@@ -83,7 +83,6 @@ impl Pattern {
         Self { kind, colors: [first, second, third], scale, seed: random.random() }
     }
 
-    /// The main colour.
     pub fn main(&self) -> Vec3 {
         self.colors[0]
     }

@@ -91,7 +91,6 @@ fn least_opacity(material: &gltf::Material) -> f32 {
     }
 }
 
-/// Whether nothing of a material is seen.
 pub fn is_invisible(material: &gltf::Material) -> bool {
     let ([.., opacity], texture) = base(material);
     texture.is_none() && opacity < least_opacity(material)
@@ -149,7 +148,6 @@ impl File<'_> {
         Ok(made)
     }
 
-    /// The bytes of a picture.
     fn picture(&self, image: &gltf::Image) -> Result<Vec<u8>, FileError> {
         let number = image.index();
         match image.source() {

@@ -19,7 +19,6 @@ const TEXTURE: u32 = 512;
 const GARMENT: f32 = 0.2;
 
 impl Person<'_> {
-    /// Adds the meshes of the worn proxies.
     pub fn add_worn(&self, mesh: &mut Mesh) {
         let Worn { suit, shoes, hair, hat, other } = &self.worn;
         let outfit = &self.outfit;

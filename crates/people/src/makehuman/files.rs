@@ -151,7 +151,6 @@ pub fn vector<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
     Some(METRES * Vec3::new(next()?, next()?, next()?))
 }
 
-/// The next N numbers.
 pub fn numbers<'a, T: FromStr, const N: usize>(words: &mut impl Iterator<Item = &'a str>) -> Option<[T; N]> {
     let values: Option<Vec<T>> = (0..N).map(|_| words.next()?.parse().ok()).collect();
     values?.try_into().ok()

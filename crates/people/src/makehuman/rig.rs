@@ -26,7 +26,6 @@ impl<'a> Joints<'a> {
         Self { library, heads, tails }
     }
 
-    /// Index of a bone.
     pub fn row(&self, name: &str) -> Option<usize> {
         self.library.bones.iter().position(|bone| bone.name == name)
     }
@@ -151,7 +150,6 @@ impl<'a> Joints<'a> {
     }
 }
 
-/// A bone's name on one side.
 fn sided(name: &str, side: usize) -> String {
     format!("{name}.{}", if side == 0 { 'L' } else { 'R' })
 }

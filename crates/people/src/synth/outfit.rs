@@ -6,7 +6,6 @@ use rand::Rng;
 use crate::figure::Build;
 use crate::pattern::{Pattern, Print, hue};
 
-/// Haircuts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Cut {
     Bald,
@@ -22,7 +21,6 @@ pub enum Cut {
     Cap,
 }
 
-/// Trousers or a skirt.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Lower {
     /// `length` is a share of the leg, `flare` the additional radius at the hem in metres.

@@ -64,7 +64,6 @@ impl Bone {
     }
 }
 
-/// Kind of a part.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Trunk,
