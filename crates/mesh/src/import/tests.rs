@@ -3,7 +3,7 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use glam::{Vec2, Vec3};
-use image::{DynamicImage, ImageFormat, Rgb, RgbImage};
+use image::{DynamicImage, ImageFormat, RgbImage};
 
 use super::{read, triangles};
 use crate::mesh::Mesh;
@@ -11,14 +11,8 @@ use crate::view::{Renderer, ViewOptions};
 
 mod odd;
 
-fn as_png(picture: impl Into<DynamicImage>) -> Vec<u8> {
-    let mut bytes = Cursor::new(Vec::new());
-    picture.into().write_to(&mut bytes, ImageFormat::Png).expect("encodes");
-    bytes.into_inner()
-}
-
 /// A picture as PNG.
-fn encoded(picture: impl Into<DynamicImage>) -> Vec<u8> {
+fn as_png(picture: impl Into<DynamicImage>) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
     picture.into().write_to(&mut bytes, ImageFormat::Png).expect("encodes");
     bytes.into_inner()
@@ -27,7 +21,7 @@ fn encoded(picture: impl Into<DynamicImage>) -> Vec<u8> {
 /// A picture with one pixel of each of four colours, as PNG.
 fn png() -> Vec<u8> {
     let colors = vec![255, 0, 0, 0, 255, 0, 0, 0, 255, 9, 9, 9];
-    encoded(RgbImage::from_raw(2, 2, colors).expect("four pixels"))
+    as_png(RgbImage::from_raw(2, 2, colors).expect("four pixels"))
 }
 
 struct Folder(tempfile::TempDir);
