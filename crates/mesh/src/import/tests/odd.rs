@@ -199,10 +199,6 @@ fn glbs_of_every_writer_are_read() {
             with(PLAIN, SOURCE, &required("KHR_draco_mesh_compression")),
             "KHR_draco_mesh_compression, which is not read: export",
         ),
-        (
-            with(PLAIN, SOURCE, &required("EXT_meshopt_compression")),
-            "EXT_meshopt_compression, which is not read: export",
-        ),
         (with(PLAIN, SOURCE, &required("ACME_secret")), "requires the extension ACME_secret"),
         (with(PLAIN, r#""textures":[{}]"#, ""), "texture 0 has no picture"),
         (
