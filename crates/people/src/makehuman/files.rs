@@ -117,7 +117,15 @@ impl Library {
         if let Some(target) = targets().get(&path) {
             return Ok(target.clone());
         }
-        let target = Arc::new(read_target(&path, self.positions.len())?);
+        let text = read_text(&path)?;
+        let mut moves = Vec::new();
+        for (number, line) in text.lines().enumerate() {
+            let mut words = line.split_ascii_whitespace();
+            let Some(first) = words.next().filter(|word| !word.starts_with('#')) else { continue };
+            let row = first.parse().ok().filter(|row: &u32| (*row as usize) < self.positions.len());
+            moves.push(row.zip(vector(words)).ok_or_else(|| wrong(&path, number, line))?);
+        }
+        let target = Arc::new(moves);
         targets().insert(path, target.clone());
         Ok(target)
     }
@@ -195,18 +203,6 @@ pub fn read_obj(path: &Path) -> Result<(Vec<Vec3>, Vec<Face>), FileError> {
         }
     }
     Ok((positions, faces))
-}
-
-fn read_target(path: &Path, vertices: usize) -> Result<Vec<(u32, Vec3)>, FileError> {
-    let text = read_text(path)?;
-    let mut moves = Vec::new();
-    for (number, line) in text.lines().enumerate() {
-        let mut words = line.split_ascii_whitespace();
-        let Some(first) = words.next().filter(|word| !word.starts_with('#')) else { continue };
-        let row = first.parse().ok().filter(|row: &u32| (*row as usize) < vertices);
-        moves.push(row.zip(vector(words)).ok_or_else(|| wrong(path, number, line))?);
-    }
-    Ok(moves)
 }
 
 #[derive(Deserialize)]
