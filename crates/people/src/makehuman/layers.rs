@@ -166,21 +166,15 @@ impl Person<'_> {
         (0..self.body.parts.len()).filter(|row| self.body.parts[*row].kind == Kind::Skirt)
     }
 
-    /// Distance from the edges of a skirt or a coat's tail in metres, positive inside.
-    fn in_drape(&self, row: usize, vertex: &Vertex) -> f32 {
-        let part = &self.body.parts[row];
-        let along = part.chart(vertex.rest).1;
-        let band = if part.side == 1 { -1.0 } else { 0.0 };
-        (part.length - along).min(along - band).clamp(-FAR, FAR)
-    }
-
     /// A skirt or the tail of a coat. `under`: the pieces below it, from the inside out.
     pub fn skirt(&self, row: usize, under: &[&Piece]) -> Piece {
-        let is_coat = self.body.parts[row].side == 1;
+        let part = &self.body.parts[row];
+        let is_coat = part.side == 1;
+        let along = |vertex: &Vertex| part.chart(vertex.rest).1;
         let mut patch = self.group("helper-skirt").subdivided(self.detail.steps(2));
         let off = if is_coat { 0.012 } else { 0.004 } + self.outfit.lower_thickness;
         // Close to the body at the waist.
-        let loose = |vertex: &Vertex| smoothstep(0.0, 0.08, self.body.parts[row].chart(vertex.rest).1);
+        let loose = |vertex: &Vertex| smoothstep(0.0, 0.08, along(vertex));
         let folds = |vertex: &Vertex| {
             let p = vertex.rest - self.figure.pelvis.start;
             let angle = libm::atan2f(p.x, p.z);
@@ -188,7 +182,9 @@ impl Person<'_> {
             0.012 * down * noise(Vec3::new(2.2 * angle, 1.5 * p.y, 0.0), self.outfit.seed)
         };
         patch.inflate(|vertex| loose(vertex) * off + folds(vertex));
-        let mut patch = patch.cut(|vertex| self.in_drape(row, vertex));
+        let band = if is_coat { -1.0 } else { 0.0 };
+        let inside = |along: f32| (part.length - along).min(along - band).clamp(-FAR, FAR);
+        let mut patch = patch.cut(|vertex| inside(along(vertex)));
         for piece in under {
             push_out(&mut patch, &piece.patch, true, |vertex| GAP * (0.5 + 1.5 * loose(vertex)));
         }
