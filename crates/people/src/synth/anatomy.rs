@@ -243,11 +243,8 @@ pub fn drapes(figure: &Figure, outfit: &Outfit) -> Vec<Part> {
         let bones = thighs.iter().chain(calves);
         let points = bones.flat_map(|bone| (0..=10).map(|i| bone.point(i as f32 / 10.0)));
         let (low, high) = bounds(points.filter(|p| p.y > bottom - 0.02));
-        let (mut centre, mut reach) = (Vec2::ZERO, Vec2::ZERO);
-        if low.is_finite() {
-            centre = (low + high).xz() / 2.0;
-            reach = (high - low).xz() / 2.0;
-        }
+        let around_legs = ((low + high).xz() / 2.0, (high - low).xz() / 2.0);
+        let (centre, reach) = if low.is_finite() { around_legs } else { (Vec2::ZERO, Vec2::ZERO) };
         let hips = h * girth * (0.098 - 0.008 * build.sex);
         let limb = 0.058 * h * girth + 0.012 + thickness;
         // An ellipse around two legs side by side is wider than their box.
