@@ -76,10 +76,11 @@ impl Mix {
         };
         let muscles = || three(self.muscle, ["minmuscle", "averagemuscle", "maxmuscle"]);
         let weights = || three(self.weight, ["minweight", "averageweight", "maxweight"]);
-        let heights = [("minheight", 1.0 - 2.0 * self.height), ("maxheight", 2.0 * self.height - 1.0)];
-        let proportions = [
-            ("uncommonproportions", 1.0 - 2.0 * self.proportions),
-            ("idealproportions", 2.0 * self.proportions - 1.0),
+        let extremes = [
+            ("height", "minheight", 1.0 - 2.0 * self.height),
+            ("height", "maxheight", 2.0 * self.height - 1.0),
+            ("proportions", "uncommonproportions", 1.0 - 2.0 * self.proportions),
+            ("proportions", "idealproportions", 2.0 * self.proportions - 1.0),
         ];
         let mut found = Vec::new();
         for (sex, a) in sexes {
@@ -92,11 +93,8 @@ impl Mix {
                         let share = a * b * c * d;
                         let of = format!("{sex}-{age}-{muscle}-{weight}");
                         found.push((format!("macrodetails/universal-{of}"), share));
-                        for (height, e) in heights {
-                            found.push((format!("macrodetails/height/{of}-{height}"), share * e));
-                        }
-                        for (proportion, e) in proportions {
-                            found.push((format!("macrodetails/proportions/{of}-{proportion}"), share * e));
+                        for (folder, extreme, e) in extremes {
+                            found.push((format!("macrodetails/{folder}/{of}-{extreme}"), share * e));
                         }
                     }
                 }
