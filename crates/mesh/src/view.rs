@@ -150,7 +150,11 @@ impl<'a> Renderer<'a> {
             lists.iter_mut().for_each(|list| list.push(index));
         }
 
-        let places = places(options.samples);
+        // Positions of the samples within a pixel, in 1/[`SUBPIXELS`]. The last one is the centre, for depth.
+        let n = options.samples;
+        let place = |i: usize| (2 * i as i64 + 1) * SUBPIXELS / (2 * n as i64);
+        let grid = (0..n * n).map(|i| [place(i % n), place(i / n)]);
+        let places = grid.chain([[SUBPIXELS / 2; 2]]).collect();
         let light = match &options.light {
             Light::Plain(lights) => Lit::Plain(lights),
             Light::Around(surroundings) => Lit::Vertices(self.occlusion().light(surroundings, &self.normals)),
@@ -235,13 +239,6 @@ fn triangle(corners: [DVec3; 3], face: usize, has_holes: bool, camera: &Camera) 
     let plane = DVec3::new(x, y, n.z - x * c.x - y * c.y) / distance;
     let (face, is_front) = (face as u32, distance < 0.0);
     Some(Triangle { corners: rounded, plane, columns, rows, face, is_front, has_holes })
-}
-
-/// Positions of the samples within a pixel, in 1/[`SUBPIXELS`]. The last one is the centre, used only for depth.
-fn places(samples: usize) -> Vec<[i64; 2]> {
-    let place = |i: usize| (2 * i as i64 + 1) * SUBPIXELS / (2 * samples as i64);
-    let grid = (0..samples * samples).map(|i| [place(i % samples), place(i / samples)]);
-    grid.chain([[SUBPIXELS / 2; 2]]).collect()
 }
 
 /// Z-buffer of a band, from the first to the last column that triangles may touch.
