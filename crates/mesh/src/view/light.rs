@@ -70,9 +70,8 @@ impl Default for Lights {
             let (sin, cos) = (TAU * i as f32 / 6.0).sin_cos();
             (Vec3::new(sin, 0.6, cos), 0.25)
         };
-        let mut directional: Vec<(Vec3, f32)> = (0..6).map(weak).collect();
-        directional.push((Vec3::new(0.4, 0.8, 0.9), 0.35));
-        Self::new(&directional, 0.5)
+        let strong = (Vec3::new(0.4, 0.8, 0.9), 0.35);
+        Self::new(&(0..6).map(weak).chain([strong]).collect::<Vec<_>>(), 0.5)
     }
 }
 
