@@ -326,9 +326,8 @@ impl File<'_> {
         }
         let size = accessor.size();
         let stride = view.stride().unwrap_or(size);
-        let last = accessor.count().checked_sub(1);
         let end = |last: usize| last.checked_mul(stride)?.checked_add(size)?.checked_add(accessor.offset());
-        let end = last.and_then(end);
+        let end = accessor.count().checked_sub(1).and_then(end);
         let inside = view.offset().checked_add(view.length()).is_some_and(|end| end <= self.blob.len());
         if stride < size || !inside || end.is_none_or(|end| end > view.length()) {
             let count = accessor.count();
