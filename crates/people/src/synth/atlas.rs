@@ -118,8 +118,7 @@ fn pack(body: &Body, spans: &[(f32, f32)], texel: f32) -> (Vec<Chart>, [usize; 2
         }
     };
     let mut charts: Vec<Chart> = body.parts.iter().zip(spans).map(chart).collect();
-    let widest = charts.iter().map(|c| c.size[0] + GAP).max().unwrap_or(0);
-    let width = WIDTH.max(widest);
+    let width = charts.iter().map(|c| c.size[0] + GAP).fold(WIDTH, usize::max);
     let mut order: Vec<usize> = (0..charts.len()).collect();
     order.sort_by_key(|i| std::cmp::Reverse(charts[*i].size[1]));
     let (mut x, mut y, mut shelf) = (0, 0, 0);
