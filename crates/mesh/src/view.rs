@@ -142,8 +142,7 @@ impl<'a> Renderer<'a> {
             let corners = face.positions.map(|row| corners[row as usize]);
             triangle(corners, row, self.holes(face).is_some(), camera)
         };
-        let faces = self.mesh.faces.par_iter().enumerate();
-        let triangles: Vec<Triangle> = faces.filter_map(projected).collect();
+        let triangles: Vec<Triangle> = self.mesh.faces.par_iter().enumerate().filter_map(projected).collect();
         let mut lists: Vec<Vec<u32>> = vec![Vec::new(); height.div_ceil(BAND)];
         for (index, t) in (0..).zip(&triangles) {
             let lists = &mut lists[t.rows[0] / BAND..=t.rows[1] / BAND];

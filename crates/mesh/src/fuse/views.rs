@@ -261,13 +261,12 @@ impl Mean {
 /// Colours of all positions. Positions that no view shows (armpits, soles) have the mean colour of their neighbours.
 pub fn colors(mesh: &Mesh, views: &[View], cell: f32) -> Vec<Vec3> {
     let normals = mesh.normals();
-    let seen = mesh.positions.par_iter().zip(&normals);
     let color = |(place, normal): (&Vec3, &Vec3)| {
         let mut mean = Mean::default();
         views.iter().for_each(|view| mean.add(view, *place, *normal, REACH * cell));
         mean.color()
     };
-    let mut colors: Vec<Option<Vec3>> = seen.map(color).collect();
+    let mut colors: Vec<Option<Vec3>> = mesh.positions.par_iter().zip(&normals).map(color).collect();
     for _ in 0..ROUNDS {
         if colors.iter().all(Option::is_some) {
             break;

@@ -52,8 +52,7 @@ impl Avatars {
         if files.is_empty() {
             return Err(FileError::unsuitable(folder, "holds no character: no file .glb"));
         }
-        let people: BTreeSet<String> = files.iter().map(|path| person_of(path)).collect();
-        let people: Vec<String> = people.into_iter().collect();
+        let people = Vec::from_iter(files.iter().map(|path| person_of(path)).collect::<BTreeSet<String>>());
         let index = |path: &Path| people.binary_search(&person_of(path)).unwrap_or(0);
         files.retain(|path| is_chosen(index(path)));
         if files.is_empty() {
