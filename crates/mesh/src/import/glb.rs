@@ -206,7 +206,8 @@ impl File<'_> {
             return Ok(());
         }
         let set = texture_set(primitive);
-        let count = primitive.get(&gltf::Semantic::Positions).as_ref().map_or(0, Accessor::count);
+        let accessor = primitive.get(&gltf::Semantic::Positions);
+        let count = accessor.as_ref().map_or(0, Accessor::count);
         let joints = place.skin.map(|skin| &skins[skin][..]);
         let mut weights = match joints {
             Some(joints) => self.weights(primitive, count, joints)?,
@@ -216,9 +217,7 @@ impl File<'_> {
         // A skin replaces the transform of the node.
         let to_world = joints.map_or(self.worlds[place.node].1, |_| Mat4::IDENTITY);
         let reader = primitive.reader(|_| Some(&self.blob));
-        let read =
-            primitive.get(&gltf::Semantic::Positions).into_iter().flat_map(|rows| self.numbers::<3>(&rows));
-        let read = read.map(Vec3::from_array);
+        let read = accessor.into_iter().flat_map(|rows| self.numbers::<3>(&rows)).map(Vec3::from_array);
         let positions: Vec<Vec3> = match joints {
             Some(joints) => read.zip(&weights).map(|(p, weights)| moved(p, weights, joints)).collect(),
             None => read.map(|p| to_world.transform_point3(p)).collect(),
