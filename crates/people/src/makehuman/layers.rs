@@ -126,8 +126,7 @@ impl Person<'_> {
     pub fn layers(&self) -> [Piece; 2] {
         let top = self.top();
         let kinds = [Kind::Trunk, Kind::Leg];
-        let mut bottom =
-            self.layer(&kinds, |vertex| self.in_bottom(vertex), |vertex| self.off_bottom(vertex));
+        let mut bottom = self.layer(&kinds, |at| self.in_bottom(at), |at| self.off_bottom(at));
         let depth = |vertex: &Vertex| self.in_top(vertex).min(self.in_bottom(vertex));
         let depths: Vec<f32> = bottom.patch.vertices.iter().map(depth).collect();
         // With the whole gap, four times as many vertices come through at creases.
