@@ -42,8 +42,7 @@ pub fn mesh(body: &Body, cell: f32) -> Surface {
     let shape = RuntimeShape::<u32, 3>::new([nx as u32, ny as u32, nz as u32]);
     surface_nets(&values, &shape, [0; 3], [nx as u32 - 1, ny as u32 - 1, nz as u32 - 1], &mut buffer);
     drop(values);
-    let positions: Vec<Vec3> =
-        buffer.positions.iter().map(|p| origin + cell * Vec3::from_array(*p)).collect();
+    let positions = buffer.positions.iter().map(|p| origin + cell * Vec3::from_array(*p)).collect();
     let faces = buffer.indices.chunks_exact(3).map(|f| [f[0], f[1], f[2]]).collect();
     let (positions, faces) = largest_piece(positions, faces);
     let (positions, parts) = positions.into_par_iter().map(|p| settle(body, p, cell)).unzip();
