@@ -85,10 +85,8 @@ impl Region {
 
     /// Number of compared pixels.
     pub fn pixels(&self) -> usize {
-        match &self.inside {
-            Some(inside) => inside.iter().filter(|set| **set).count(),
-            None => self.window[2] * self.window[3],
-        }
+        let [.., width, height] = self.window;
+        self.inside.as_ref().map_or(width * height, |inside| inside.iter().filter(|set| **set).count())
     }
 }
 
