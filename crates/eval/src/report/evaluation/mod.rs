@@ -109,10 +109,8 @@ impl Evaluation<'_> {
     /// `report.json`.
     pub fn json(&self) -> Value {
         let mut report = self.header.json();
-        report["protocols"] = match self.model() {
-            Some(model) => self.by_protocol(|protocol| self.protocol_json(model, protocol)),
-            None => json!({}),
-        };
+        let protocols = |model| self.by_protocol(|protocol| self.protocol_json(model, protocol));
+        report["protocols"] = self.model().map_or(json!({}), protocols);
         let plain = |judged: &Judged| {
             self.by_protocol(|protocol| {
                 let mut value = figures(Self::overall(&by_person(judged.rows.iter(), protocol)));
