@@ -49,14 +49,8 @@ pub fn cases() -> Vec<Case> {
         let rows = changed(2..3, |row| row[10] = opacity);
         add(format!("opacity {opacity:?}"), equal, rows, camera);
     }
-    for (name, norm) in [
-        ("0", 0.0_f32),
-        ("1e-20", 1e-20),
-        ("1e-5", 1e-5),
-        ("1e15", 1e15),
-        ("1e20", 1e20),
-        ("−1 (signs flipped)", -1.0),
-    ] {
+    let names = ["0", "1e-20", "1e-5", "1e15", "1e20", "−1 (signs flipped)"];
+    for (name, norm) in names.into_iter().zip([0.0_f32, 1e-20, 1e-5, 1e15, 1e20, -1.0]) {
         let rows = changed(2..3, |row| {
             let before = row[3..7].iter().map(|q| q * q).sum::<f32>().sqrt();
             row[3..7].iter_mut().for_each(|q| *q *= norm / before);
@@ -65,12 +59,8 @@ pub fn cases() -> Vec<Case> {
         let holds = if QUATERNIONS.contains(&norm.abs()) { equal } else { left_out };
         add(format!("quaternion of norm {name}"), holds, rows, camera);
     }
-    for (name, z) in [
-        ("at", 0.2_f32),
-        ("just before", 0.2 - 1e-6),
-        ("just beyond", 0.2 + 1e-6),
-        ("behind the camera", -1.0),
-    ] {
+    let names = ["at", "just before", "just beyond", "behind the camera"];
+    for (name, z) in names.into_iter().zip([0.2_f32, 0.2 - 1e-6, 0.2 + 1e-6, -1.0]) {
         let rows = changed(2..3, |row| row[2] = z);
         let name = if z < 0.0 { name.to_owned() } else { format!("{name} the near plane") };
         add(name, "left out where the oracle leaves it out", rows, camera);
