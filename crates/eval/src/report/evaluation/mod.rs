@@ -109,7 +109,7 @@ impl Evaluation<'_> {
     /// `report.json`.
     pub fn json(&self) -> Value {
         let mut report = self.header.json();
-        let protocols = |model| self.by_protocol(|protocol| self.protocol_json(model, protocol));
+        let protocols = |model: &Judged| self.by_protocol(|protocol| self.protocol_json(model, protocol));
         report["protocols"] = self.model().map_or(json!({}), protocols);
         let plain = |judged: &Judged| {
             self.by_protocol(|protocol| {
