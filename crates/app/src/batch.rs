@@ -9,8 +9,8 @@ use std::thread;
 use std::time::Duration;
 
 use clap::Args;
-use snapsnap_base::file;
 use snapsnap_base::folder::entries;
+use snapsnap_base::{FileError, file};
 use snapsnap_data::Shard;
 use snapsnap_splat::scene::Kind;
 
@@ -125,7 +125,7 @@ impl Batch {
             return Err(failure);
         }
         let path = self.path();
-        let wrong = |e: csv::Error| Failure::cannot_write(&path, &e.into());
+        let wrong = |e: csv::Error| FileError::write(&path)(e.into());
         if self.list.is_none() {
             let mut list = csv::Writer::from_path(&path).map_err(wrong)?;
             list.write_record(HEADER.split(',')).map_err(wrong)?;
@@ -138,7 +138,7 @@ impl Batch {
             format!("{}{}", if is_formula { "'" } else { "" }, say::printable(text))
         };
         list.write_record([cell(name), cell(&failure.to_string())]).map_err(wrong)?;
-        list.flush().map_err(|e| Failure::cannot_write(&path, &e))?;
+        list.flush().map_err(FileError::write(&path))?;
         self.failed += 1;
         say::err(&format!("{name}: {failure}"));
         self.bugs = if matches!(failure, Failure::Internal(_)) { self.bugs + 1 } else { 0 };

@@ -1,7 +1,6 @@
 //! Failures of commands: bad input or an output that cannot be written (exit code 2), or other errors (exit code 1).
 
 use std::fmt;
-use std::io;
 use std::path::Path;
 
 use snapsnap_base::FileError;
@@ -37,11 +36,6 @@ impl Failure {
     /// A user's error about this file or folder.
     pub fn file(path: &Path, message: impl fmt::Display) -> Self {
         Self::Input(format!("{}: {message}", path.display()))
-    }
-
-    /// The operating system refused to write this file.
-    pub fn cannot_write(path: &Path, e: &io::Error) -> Self {
-        Self::Write(format!("{}: cannot write: {e}", path.display()))
     }
 
     /// The same message after the name of a file.

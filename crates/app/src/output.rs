@@ -5,6 +5,7 @@ use std::io::{ErrorKind, Write};
 use std::path::{Component, Path, PathBuf};
 
 use serde::Serialize;
+use snapsnap_base::FileError;
 use snapsnap_base::config::{differences, keys};
 use snapsnap_base::file::{self, write_whole};
 use snapsnap_splat::scene::Kind;
@@ -13,13 +14,13 @@ use crate::failure::Failure;
 
 /// Writes a file, whole or not at all.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
-    write_whole(path, |out| out.write_all(bytes)).map_err(|e| Failure::cannot_write(path, &e))
+    Ok(write_whole(path, |out| out.write_all(bytes)).map_err(FileError::write(path))?)
 }
 
 /// Removes a file unless it is missing.
 pub fn remove(path: &Path) -> Result<(), Failure> {
     match fs::remove_file(path) {
-        Err(e) if e.kind() != ErrorKind::NotFound => Err(Failure::cannot_write(path, &e)),
+        Err(e) if e.kind() != ErrorKind::NotFound => Err(FileError::write(path)(e).into()),
         _ => Ok(()),
     }
 }
@@ -30,7 +31,7 @@ pub fn check_folder(path: &Path) -> Result<(), Failure> {
         return Err(Failure::file(path, "exists and is no folder"));
     }
     let existing = path.ancestors().find(|path| path.exists()).unwrap_or(Path::new("."));
-    tempfile::tempfile_in(existing).map(drop).map_err(|e| Failure::cannot_write(path, &e))
+    Ok(tempfile::tempfile_in(existing).map(drop).map_err(FileError::write(path))?)
 }
 
 /// Makes a folder and its parents unless they exist.
@@ -41,7 +42,7 @@ pub fn make_folder(path: &Path) -> Result<(), Failure> {
 /// Refuses outputs that cannot be written, that are given twice or that are inputs.
 pub fn check_outputs(outputs: &[&Path], inputs: &[&Path]) -> Result<(), Failure> {
     for (i, output) in outputs.iter().enumerate() {
-        file::check_writable(output).map_err(|e| Failure::cannot_write(output, &e))?;
+        file::check_writable(output).map_err(FileError::write(output))?;
         if inputs.iter().any(|input| is_same_file(output, input)) {
             return Err(Failure::file(output, "is an input of this command and would be overwritten"));
         }
@@ -75,7 +76,7 @@ pub fn check_settings(path: &Path, there: &impl Serialize, wanted: &impl Seriali
 /// Refuses an output in a data set or its source (one of `roots`): a data set would take a folder for a subject without
 /// pictures.
 pub fn outside_data<'a>(path: &Path, roots: impl IntoIterator<Item = &'a Path>) -> Result<(), Failure> {
-    let whole = std::path::absolute(path).map_err(|e| Failure::cannot_write(path, &e))?;
+    let whole = std::path::absolute(path).map_err(FileError::write(path))?;
     // Links of existing folders are followed. `..` after a missing folder is taken literally.
     let mut there = PathBuf::new();
     for part in whole.components() {

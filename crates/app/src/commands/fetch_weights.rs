@@ -150,7 +150,7 @@ fn copy(item: &Item, folder: &Path, path: &Path) -> Result<(), Failure> {
         out.flush()?;
         check_sum(item, &from.display().to_string(), out.get_mut())
     });
-    written.map_err(|e| broken(path, &e))
+    written.map_err(|e| broken(path, e))
 }
 
 /// Downloads a file into `FILE.part`, which is renamed once its sum is right.
@@ -161,9 +161,8 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
         let message = "is no unfinished download, but a link or a special file: move it away";
         return Err(Failure::file(&part, message));
     }
-    let cannot_write = |e: io::Error| Failure::cannot_write(&part, &e);
     let file = File::options().create(true).truncate(false).read(true).write(true).open(&part);
-    let mut file = file.map_err(cannot_write)?;
+    let mut file = file.map_err(FileError::write(&part))?;
     if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
         return Err(Failure::file(&part, "is being fetched by another process"));
     }
@@ -176,16 +175,16 @@ fn download(item: &Item, address: &str, path: &Path) -> Result<(), Failure> {
     check_sum(item, address, &mut file).map_err(|e| {
         // A later run must not continue from wrong bytes.
         let _ = fs::remove_file(&part);
-        broken(&part, &e)
+        broken(&part, e)
     })?;
-    file::rename(&part, path).map_err(|e| Failure::cannot_write(path, &e))
+    Ok(file::rename(&part, path).map_err(FileError::write(path))?)
 }
 
 /// Why a file was not written.
-fn broken(path: &Path, e: &io::Error) -> Failure {
+fn broken(path: &Path, e: io::Error) -> Failure {
     match e.kind() {
         ErrorKind::InvalidData => Failure::Input(e.to_string()),
-        _ => Failure::cannot_write(path, e),
+        _ => FileError::write(path)(e).into(),
     }
 }
 
@@ -205,10 +204,9 @@ fn check_sum(item: &Item, origin: &str, file: &mut File) -> io::Result<()> {
 
 /// Lets curl download the rest of an unfinished file, in several attempts if connections break.
 fn fill(file: &mut File, part: &Path, item: &Item, address: &str) -> Result<(), Failure> {
-    let cannot_write = |e: io::Error| Failure::cannot_write(part, &e);
-    let length = |file: &File| file.metadata().map(|there| there.len()).map_err(cannot_write);
+    let length = |file: &File| file.metadata().map(|there| there.len()).map_err(FileError::write(part));
     if length(file)? > item.bytes {
-        file.set_len(0).map_err(cannot_write)?;
+        file.set_len(0).map_err(FileError::write(part))?;
     }
     // Progress is counted from the largest length so far. Servers that restart the download make none.
     let (mut fruitless, mut most) = (0, length(file)?);
@@ -225,7 +223,7 @@ fn fill(file: &mut File, part: &Path, item: &Item, address: &str) -> Result<(), 
         })?;
         let after = length(file)?;
         if ended.code() == Some(NO_RANGES) || ended.code() == Some(TOO_LONG) {
-            file.set_len(0).map_err(cannot_write)?;
+            file.set_len(0).map_err(FileError::write(part))?;
         }
         if ended.code() == Some(TOO_LONG) {
             let message = format!("the content is not that of {}: it is longer; nothing was kept", item.file);

@@ -9,7 +9,7 @@ use std::time::Instant;
 use burn::tensor::{Device, Tensor};
 use clap::Args;
 use serde_json::json;
-use snapsnap_base::file;
+use snapsnap_base::{FileError, file};
 use snapsnap_splat::{
     Camera, Counts, MAX_SIDE, Preset, RenderOptions, Rendered, SplatError, camera_file, render,
 };
@@ -265,7 +265,7 @@ impl Raw {
         // The output's file system has room for the values. A pipe has no file system.
         let is_special = file::is_special(path);
         let folder = if is_special { std::env::temp_dir() } else { file::folder_of(path).to_owned() };
-        let part = || tempfile::tempfile_in(&folder).map_err(|e| Failure::cannot_write(path, &e));
+        let part = || tempfile::tempfile_in(&folder).map_err(FileError::write(path));
         let parts = [part()?, part()?, part()?].map(BufWriter::new);
         Ok(Self { path: path.to_owned(), parts })
     }
@@ -275,7 +275,7 @@ impl Raw {
         let tensors = [rendered.color.reshape([-1]), rendered.alpha.reshape([-1]), depth.reshape([-1])];
         for (file, tensor) in self.parts.iter_mut().zip(tensors) {
             let bytes: Vec<u8> = read_back(tensor)?.iter().flat_map(|v| v.to_le_bytes()).collect();
-            file.write_all(&bytes).map_err(|e| Failure::cannot_write(&self.path, &e))?;
+            file.write_all(&bytes).map_err(FileError::write(&self.path))?;
         }
         Ok(())
     }
@@ -293,7 +293,7 @@ impl Raw {
         .into_bytes();
         header.resize(header.len().next_multiple_of(8), b' ');
         let path = self.path;
-        file::write_whole(&path, |out| -> io::Result<()> {
+        let written = file::write_whole(&path, |out| -> io::Result<()> {
             out.write_all(&(header.len() as u64).to_le_bytes())?;
             out.write_all(&header)?;
             for part in self.parts {
@@ -302,8 +302,8 @@ impl Raw {
                 io::copy(&mut part, out)?;
             }
             Ok(())
-        })
-        .map_err(|e| Failure::cannot_write(&path, &e))
+        });
+        Ok(written.map_err(FileError::write(&path))?)
     }
 }
 

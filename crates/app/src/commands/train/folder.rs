@@ -4,6 +4,7 @@ use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use snapsnap_base::FileError;
 use snapsnap_base::config::Schema;
 use snapsnap_data::dataset::Folder;
 use snapsnap_train::config::TrainConfig;
@@ -69,7 +70,7 @@ impl RunFolder {
         let lock = path.join(LOCK);
         let is_new = !lock.exists();
         let file = File::options().create(true).truncate(false).write(true).open(&lock);
-        let file = file.map_err(|e| Failure::cannot_write(&lock, &e))?;
+        let file = file.map_err(FileError::write(&lock))?;
         // Some file systems have no locks. The run goes on without one.
         if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
             return Err(wrong("is being trained by another process"));
