@@ -1,7 +1,7 @@
 //! The differentiable rasteriser.
 
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
 use burn::tensor::{Tensor, TensorData};
 use pyo3::exceptions::PyRuntimeError;
@@ -16,7 +16,7 @@ use crate::work::{run, unsuitable};
 
 /// What the backward pass of a render needs. It is used once.
 #[pyclass(frozen)]
-pub struct Tape(Arc<Mutex<Option<Forward>>>);
+pub struct Tape(Mutex<Option<Forward>>);
 
 struct Forward {
     inputs: Gaussians,
@@ -90,7 +90,7 @@ pub fn rasterize<'py>(
     device: String,
     gradients: bool,
 ) -> PyResult<Output<'py>> {
-    let (forward, [color, alpha, depth]) = run(py, move |_| {
+    let (forward, color, alpha, depth) = run(py, move |_| {
         let preset = match &*preset {
             "inria" => Preset::Inria,
             "gsplat" => Preset::Gsplat,
@@ -98,35 +98,27 @@ pub fn rasterize<'py>(
         };
         let device = snapsnap::device::choose_for_one(&device)?;
         let device = if gradients { device.autodiff() } else { device };
-        let mut inputs = gaussians(&arrays, &device)?;
-        let mut background: Option<Tensor<1>> =
-            background.map(|color| tensor(&color, 3, &device).squeeze_dim(0));
-        if gradients {
-            let Gaussians { means, rotations, scales, opacities, colors } = inputs;
-            inputs = Gaussians {
-                means: means.require_grad(),
-                rotations: rotations.require_grad(),
-                scales: scales.require_grad(),
-                opacities: opacities.require_grad(),
-                colors: colors.require_grad(),
-            };
-            background = background.map(Tensor::require_grad);
-        }
+        let Gaussians { means, rotations, scales, opacities, colors } = gaussians(&arrays, &device)?;
+        let inputs = Gaussians {
+            means: means.set_require_grad(gradients),
+            rotations: rotations.set_require_grad(gradients),
+            scales: scales.set_require_grad(gradients),
+            opacities: opacities.set_require_grad(gradients),
+            colors: colors.set_require_grad(gradients),
+        };
+        let background = background.map(|color| tensor(&color, 3, &device).squeeze_dim::<1>(0));
+        let background = background.map(|color| color.set_require_grad(gradients));
         let cameras = cameras(cameras_json.as_deref(), cameras_path.as_deref())?;
         let mut options = preset.options();
         (options.antialiased, options.depth) = (antialiased, depth);
         options.background.clone_from(&background);
         let rendered = render(&inputs, &cameras, &options)?;
-        let numbers = [
-            Some(host(rendered.color.clone())),
-            Some(host(rendered.alpha.clone())),
-            rendered.depth.clone().map(host),
-        ];
-        Ok((Forward { inputs, background, rendered }, numbers))
+        let (color, alpha) = (host(rendered.color.clone()), host(rendered.alpha.clone()));
+        let depth = rendered.depth.clone().map(host);
+        Ok((Forward { inputs, background, rendered }, color, alpha, depth))
     })?;
     let [views, height, width, _] = forward.rendered.color.dims();
-    let array = |values: Option<Vec<f32>>| values.map(|values| bytes(py, &values));
-    let tape = gradients.then(|| Tape(Arc::new(Mutex::new(Some(forward)))));
-    let [color, alpha] = [color, alpha].map(|values| bytes(py, &values.unwrap_or_default()));
-    Ok(([views, height, width], color, alpha, array(depth), tape))
+    let tape = gradients.then(|| Tape(Mutex::new(Some(forward))));
+    let depth = depth.map(|values| bytes(py, &values));
+    Ok(([views, height, width], bytes(py, &color), bytes(py, &alpha), depth, tape))
 }
