@@ -31,6 +31,7 @@ mod view_folder;
 mod weights;
 
 use std::ffi::OsString;
+use std::path::PathBuf;
 
 use clap::{CommandFactory, Parser, Subcommand};
 use failure::bail;
@@ -122,9 +123,10 @@ enum Command {
     Convert(commands::convert::Arguments),
     /// Make or check a data set of people to train on.
     #[command(
+        subcommand,
         after_help = "Example: snapsnap prepare synth --subjects 300 --seed 1 --config configs/data/small.toml -o people/synth"
     )]
-    Prepare(commands::prepare::Arguments),
+    Prepare(commands::prepare::Kind),
     /// Train the point predictor.
     #[command(
         name = "train-stage1",
@@ -177,10 +179,17 @@ enum Command {
     #[command(
         after_help = "Example: snapsnap completions bash > ~/.local/share/bash-completion/completions/snapsnap"
     )]
-    Completions(commands::manuals::CompletionArguments),
+    Completions {
+        /// The shell.
+        shell: clap_complete::Shell,
+    },
     /// Write a manual page for each command.
     #[command(after_help = "Example: snapsnap man -o ~/.local/share/man/man1")]
-    Man(commands::manuals::ManArguments),
+    Man {
+        /// Folder for the pages.
+        #[arg(short, long, value_name = "DIR")]
+        output: PathBuf,
+    },
 }
 
 /// Prepares a process for this library's work.
@@ -232,7 +241,7 @@ pub fn main(program: &[OsString], arguments: Vec<OsString>) -> u8 {
         Command::Mesh(arguments) => commands::mesh::run(&arguments),
         Command::Rig(arguments) => commands::rig::run(&arguments),
         Command::Convert(arguments) => commands::convert::run(&arguments),
-        Command::Prepare(arguments) => commands::prepare::run(&arguments),
+        Command::Prepare(kind) => commands::prepare::run(&kind),
         Command::TrainStage1(arguments) => return ended(commands::train::stage1(&arguments)),
         Command::TrainStage2(arguments) => return ended(commands::train::stage2(&arguments)),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments),
@@ -245,8 +254,8 @@ pub fn main(program: &[OsString], arguments: Vec<OsString>) -> u8 {
         Command::ExportWeights(arguments) => commands::weight_files::export(&arguments),
         Command::Doctor(arguments) => commands::doctor::run(&arguments),
         Command::ProbeAdapters => say::json(&device::probe()),
-        Command::Completions(arguments) => commands::manuals::completions(&arguments, Arguments::command()),
-        Command::Man(arguments) => commands::manuals::pages(&arguments, Arguments::command()),
+        Command::Completions { shell } => commands::manuals::completions(shell, Arguments::command()),
+        Command::Man { output } => commands::manuals::pages(&output, Arguments::command()),
     };
     ended(result.map(|()| 0))
 }

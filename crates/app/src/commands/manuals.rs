@@ -1,8 +1,8 @@
 //! `snapsnap completions` and `snapsnap man`.
 
-use std::path::PathBuf;
+use std::path::Path;
 
-use clap::{Args, Command};
+use clap::Command;
 use clap_complete::Shell;
 use clap_mangen::Man;
 
@@ -10,32 +10,18 @@ use crate::failure::Failure;
 use crate::output::{self, make_folder};
 use crate::say;
 
-#[derive(Args)]
-pub struct CompletionArguments {
-    /// The shell.
-    #[arg(value_enum)]
-    shell: Shell,
-}
-
-#[derive(Args)]
-pub struct ManArguments {
-    /// Folder for the pages.
-    #[arg(short, long, value_name = "DIR")]
-    output: PathBuf,
-}
-
 /// Prints the completions of `command`.
-pub fn completions(arguments: &CompletionArguments, mut command: Command) -> Result<(), Failure> {
+pub fn completions(shell: Shell, mut command: Command) -> Result<(), Failure> {
     let mut text = Vec::new();
-    clap_complete::generate(arguments.shell, &mut command, "snapsnap", &mut text);
+    clap_complete::generate(shell, &mut command, "snapsnap", &mut text);
     say::result(&text)
 }
 
-/// Writes the manual pages of `command` and of its subcommands.
-pub fn pages(arguments: &ManArguments, mut command: Command) -> Result<(), Failure> {
+/// Writes the manual pages of `command` and of its subcommands to a folder.
+pub fn pages(folder: &Path, mut command: Command) -> Result<(), Failure> {
     // Computes the display names of subcommands.
     command.build();
-    make_folder(&arguments.output)?;
+    make_folder(folder)?;
     let mut count = 0;
     let mut waiting = vec![command];
     while let Some(command) = waiting.pop() {
@@ -43,12 +29,12 @@ pub fn pages(arguments: &ManArguments, mut command: Command) -> Result<(), Failu
         let mut page = Vec::new();
         let rendered = Man::new(command.clone()).title(&name).render(&mut page);
         rendered.map_err(|e| Failure::Internal(e.to_string()))?;
-        output::write(&arguments.output.join(format!("{name}.1")), &page)?;
+        output::write(&folder.join(format!("{name}.1")), &page)?;
         count += 1;
         // `help` contains all other commands again.
         let visible = |command: &&Command| !command.is_hide_set() && command.get_name() != "help";
         waiting.extend(command.get_subcommands().filter(visible).cloned());
     }
-    say::info(&format!("{}: {count} pages", arguments.output.display()));
+    say::info(&format!("{}: {count} pages", folder.display()));
     Ok(())
 }

@@ -27,14 +27,8 @@ use crate::{output, say};
 /// Name of the resolved config in the data set.
 const CONFIG: &str = "prepare.config.toml";
 
-#[derive(Args)]
-pub struct Arguments {
-    #[command(subcommand)]
-    kind: Kind,
-}
-
 #[derive(Subcommand)]
-enum Kind {
+pub enum Kind {
     /// Render scans, OBJ, PLY or GLB, into a data set.
     #[command(
         after_help = "Example: snapsnap prepare scan path/to/scans --split train --config configs/data/small.toml -o people/scans"
@@ -57,27 +51,24 @@ enum Kind {
     Avatars(generate::AvatarsArguments),
     /// List the faults of a data set.
     #[command(after_help = "Example: snapsnap prepare check people/synth")]
-    Check(CheckArguments),
+    Check {
+        /// Folder of the data set, in this program's layout or in the layout of the authors' tools.
+        dataset: PathBuf,
+    },
 }
 
-pub fn run(arguments: &Arguments) -> Result<(), Failure> {
-    match &arguments.kind {
+pub fn run(kind: &Kind) -> Result<(), Failure> {
+    match kind {
         Kind::Scan(arguments) => scan::run(arguments),
         Kind::Synth(arguments) => generate::synth(arguments),
         Kind::Makehuman(arguments) => generate::makehuman(arguments),
         Kind::Avatars(arguments) => generate::avatars(arguments),
-        Kind::Check(arguments) => check(arguments),
+        Kind::Check { dataset } => check(dataset),
     }
 }
 
-#[derive(Args)]
-struct CheckArguments {
-    /// Folder of the data set, in this program's layout or in the layout of the authors' tools.
-    dataset: PathBuf,
-}
-
-fn check(arguments: &CheckArguments) -> Result<(), Failure> {
-    let checked = dataset::check(&arguments.dataset, Progress::counted("subjects"))?;
+fn check(folder: &Path) -> Result<(), Failure> {
+    let checked = dataset::check(folder, Progress::counted("subjects"))?;
     for problem in &checked.problems {
         say::out(problem);
     }
