@@ -56,7 +56,6 @@ enum Window {
 
 /// Figures of two pictures.
 struct Compared {
-    name: String,
     score: Score,
     ssim_gaussian: f64,
     region: Region,
@@ -101,24 +100,28 @@ fn folders(arguments: &Arguments, lpips: &Result<Lpips, String>) -> Result<(), F
     for name in ours.intersection(&truths) {
         let mask = mask.as_ref().map(|folder| folder.join(name));
         match compare(arguments, &a.join(name), &b.join(name), mask.as_deref(), lpips) {
-            Ok(found) => compared.push(found),
+            Ok(found) => compared.push((name, found)),
             Err(failure) => left_out.push(LeftOut::new(name, failure)),
         }
     }
-    let scores: Vec<Score> = compared.iter().map(|c| c.score).collect();
+    let scores: Vec<Score> = compared.iter().map(|(_, found)| found.score).collect();
     let mean = Score::mean(&scores);
     if arguments.json {
-        let mut pictures: Vec<Value> = compared.iter().map(json_of).collect();
-        for (value, compared) in pictures.iter_mut().zip(&compared) {
-            value["name"] = json!(compared.name);
+        let mut pictures: Vec<Value> = compared.iter().map(|(_, found)| json_of(found)).collect();
+        for (value, (name, _)) in pictures.iter_mut().zip(&compared) {
+            value["name"] = json!(name);
         }
         let found = json!({
             "pictures": pictures, "mean": mean, "left_out": left_out, "lpips_weights": perceptual::describe(lpips),
         });
         say::json(&found.to_string())?;
     } else {
-        let line = |name: &str, score: &Score| format!("{name:<24} {}", line_of(score));
-        let mut lines: Vec<String> = compared.iter().map(|c| line(&c.name, &c.score)).collect();
+        let plain = |value: Option<f64>| value.map_or("n/a".into(), |v| format!("{v:.4}"));
+        let line = |name: &str, Score { psnr, ssim, lpips }: &Score| {
+            let (ssim, lpips) = (plain(*ssim), plain(*lpips));
+            format!("{name:<24} PSNR {psnr:.3} dB   SSIM {ssim}   LPIPS {lpips}")
+        };
+        let mut lines: Vec<String> = compared.iter().map(|(name, found)| line(name, &found.score)).collect();
         lines.extend(mean.map(|mean| line(&format!("mean of {}", compared.len()), &mean)));
         lines.push(format!("LPIPS: {}", perceptual::describe(lpips)));
         say::lines(&lines.join("\n"))?;
@@ -171,7 +174,6 @@ fn compare(
         _ => Region::all(&target),
     };
     Ok(Compared {
-        name: a.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
         score: Score::new(&image, &target, &region, lpips.as_ref().ok()).map_err(named)?,
         ssim_gaussian: ssim_of_loss(&image, &target, &region).map_err(named)?,
         region,
@@ -184,11 +186,6 @@ fn json_of(compared: &Compared) -> Value {
     value["window"] = json!(compared.region.window);
     value["pixels"] = json!(compared.region.pixels());
     value
-}
-
-fn line_of(score: &Score) -> String {
-    let plain = |value: Option<f64>| value.map_or("n/a".into(), |v| format!("{v:.4}"));
-    format!("PSNR {:.3} dB   SSIM {}   LPIPS {}", score.psnr, plain(score.ssim), plain(score.lpips))
 }
 
 fn text_of(compared: &Compared, lpips: &Result<Lpips, String>) -> String {
