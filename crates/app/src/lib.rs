@@ -34,6 +34,7 @@ use std::ffi::OsString;
 use std::path::PathBuf;
 
 use clap::{CommandFactory, Parser, Subcommand};
+use commands::train;
 use failure::bail;
 
 pub use commands::convert::drawable;
@@ -132,13 +133,13 @@ enum Command {
         name = "train-stage1",
         after_help = "Example: snapsnap train-stage1 --config configs/tiny/stage1.toml --data people/synth -o runs/points"
     )]
-    TrainStage1(commands::train::Arguments),
+    TrainStage1(train::Arguments),
     /// Train the Gaussian regressor on the output of a trained point predictor.
     #[command(
         name = "train-stage2",
         after_help = "Example: snapsnap train-stage2 --config configs/tiny/stage2.toml --data people/synth --weights runs/points/best.safetensors -o runs/human"
     )]
-    TrainStage2(commands::train::Arguments),
+    TrainStage2(train::Arguments),
     /// Evaluate a model on a data set, beside baselines and other models.
     #[command(
         after_help = "Example: snapsnap evaluate --config configs/eval.toml --data people/test -o reports/human"
@@ -242,8 +243,8 @@ pub fn main(program: &[OsString], arguments: Vec<OsString>) -> u8 {
         Command::Rig(arguments) => commands::rig::run(&arguments),
         Command::Convert(arguments) => commands::convert::run(&arguments),
         Command::Prepare(kind) => commands::prepare::run(&kind),
-        Command::TrainStage1(arguments) => return ended(commands::train::stage1(&arguments)),
-        Command::TrainStage2(arguments) => return ended(commands::train::stage2(&arguments)),
+        Command::TrainStage1(arguments) => return ended(train::among_ranks(&arguments, train::stage1)),
+        Command::TrainStage2(arguments) => return ended(train::among_ranks(&arguments, train::stage2)),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments),
         Command::Bench(arguments) => commands::bench::run(&arguments),
         Command::Stability(arguments) => commands::stability::run(&arguments),

@@ -86,25 +86,20 @@ struct Plan<'a> {
     begun: Option<(&'a Path, TrainConfig)>,
 }
 
-pub fn stage1(arguments: &Arguments) -> Result<u8, Failure> {
-    among_ranks(|ranks| points(arguments, ranks))
-}
-
-pub fn stage2(arguments: &Arguments) -> Result<u8, Failure> {
-    among_ranks(|ranks| humans(arguments, ranks))
-}
-
-/// Runs `work` as one of the ranks of MPI, if a launcher started several. The failure of one rank ends all ranks.
-fn among_ranks(work: impl FnOnce(&Ranks) -> Result<u8, Failure>) -> Result<u8, Failure> {
+/// Runs `stage` as one of the ranks of MPI, if a launcher started several. The failure of one rank ends all ranks.
+pub fn among_ranks(
+    arguments: &Arguments,
+    stage: fn(&Arguments, &Ranks) -> Result<u8, Failure>,
+) -> Result<u8, Failure> {
     let ranks = Ranks::join().map_err(Failure::Input)?;
     if ranks.size == 1 {
-        return work(&ranks);
+        return stage(arguments, &ranks);
     }
     if !ranks.is_first() {
         say::set_quiet(true);
     }
     // A panic must end the others as well, which would wait for this rank.
-    let failure = match unpanicked(|| work(&ranks)) {
+    let failure = match unpanicked(|| stage(arguments, &ranks)) {
         Ok(code) => return Ok(code),
         Err(failure) => failure,
     };
@@ -121,7 +116,7 @@ fn among_ranks(work: impl FnOnce(&Ranks) -> Result<u8, Failure>) -> Result<u8, F
     Err(failure)
 }
 
-fn points(arguments: &Arguments, ranks: &Ranks) -> Result<u8, Failure> {
+pub fn stage1(arguments: &Arguments, ranks: &Ranks) -> Result<u8, Failure> {
     let mut plan = Plan::new(arguments, ranks)?;
     plan.keep_start();
     if plan.config.stage1.only_details && plan.begun.is_none() && plan.config.training.weights.is_none() {
@@ -142,7 +137,7 @@ fn points(arguments: &Arguments, ranks: &Ranks) -> Result<u8, Failure> {
     })
 }
 
-fn humans(arguments: &Arguments, ranks: &Ranks) -> Result<u8, Failure> {
+pub fn stage2(arguments: &Arguments, ranks: &Ranks) -> Result<u8, Failure> {
     let mut plan = Plan::new(arguments, ranks)?;
     let joint = plan.config.stage2.points_weight > 0.0;
     if joint {
