@@ -23,23 +23,6 @@ use crate::say;
 /// Largest number of people of one command.
 const MAX_SUBJECTS: usize = 1_000_000;
 
-#[derive(Args)]
-pub struct MakehumanArguments {
-    /// MakeHuman's folder `data`, or a checkout that contains it.
-    folder: PathBuf,
-    #[command(flatten)]
-    generate: Generate,
-}
-
-#[derive(Args)]
-pub struct AvatarsArguments {
-    /// Folder of rigged characters, GLB, with the joint names of Mixamo or MakeHuman. Files whose names are equal up to the
-    /// last `_` show one person. Of nine people, one is for test and one for val.
-    folder: PathBuf,
-    #[command(flatten)]
-    generate: Generate,
-}
-
 /// Options of the commands that generate people.
 #[derive(Args)]
 pub struct Generate {
@@ -64,14 +47,14 @@ pub fn synth(generate: &Generate) -> Result<(), Failure> {
     generate.run("synth", &[], |name, poses, detail| Ok(synth::person(name, poses, detail)))
 }
 
-pub fn makehuman(arguments: &MakehumanArguments) -> Result<(), Failure> {
-    let library = Library::open(&arguments.folder)?;
-    arguments.generate.run("makehuman", &[library.root()], |name, poses, detail| {
+pub fn makehuman(folder: &Path, generate: &Generate) -> Result<(), Failure> {
+    let library = Library::open(folder)?;
+    generate.run("makehuman", &[library.root()], |name, poses, detail| {
         makehuman::person(&library, name, poses, detail)
     })
 }
 
-pub fn avatars(AvatarsArguments { folder, generate }: &AvatarsArguments) -> Result<(), Failure> {
+pub fn avatars(folder: &Path, generate: &Generate) -> Result<(), Failure> {
     let avatars = Avatars::open(folder, |person| match person % 9 {
         0 => generate.split == Split::Test,
         4 => generate.split == Split::Val,

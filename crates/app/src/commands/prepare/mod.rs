@@ -24,6 +24,8 @@ use crate::output::{check_folder, check_outputs, check_settings, is_same_file, o
 use crate::progress::Progress;
 use crate::{output, say};
 
+use generate::Generate;
+
 /// Name of the resolved config in the data set.
 const CONFIG: &str = "prepare.config.toml";
 
@@ -38,17 +40,28 @@ pub enum Kind {
     #[command(
         after_help = "Example: snapsnap prepare synth --subjects 300 --seed 1 --config configs/data/small.toml -o people/synth"
     )]
-    Synth(generate::Generate),
+    Synth(Generate),
     /// Make people from MakeHuman's free data.
     #[command(
         after_help = "Example: snapsnap prepare makehuman path/to/makehuman/data --subjects 300 --seed 2 -o people/makehuman"
     )]
-    Makehuman(generate::MakehumanArguments),
+    Makehuman {
+        /// MakeHuman's folder `data`, or a checkout that contains it.
+        folder: PathBuf,
+        #[command(flatten)]
+        generate: Generate,
+    },
     /// Make people from rigged characters.
     #[command(
         after_help = "Example: snapsnap prepare avatars path/to/characters --subjects 300 --seed 3 -o people/avatars"
     )]
-    Avatars(generate::AvatarsArguments),
+    Avatars {
+        /// Folder of rigged characters, GLB, with the joint names of Mixamo or MakeHuman. Files whose names are equal up to
+        /// the last `_` show one person. Of nine people, one is for test and one for val.
+        folder: PathBuf,
+        #[command(flatten)]
+        generate: Generate,
+    },
     /// List the faults of a data set.
     #[command(after_help = "Example: snapsnap prepare check people/synth")]
     Check {
@@ -60,9 +73,9 @@ pub enum Kind {
 pub fn run(kind: &Kind) -> Result<(), Failure> {
     match kind {
         Kind::Scan(arguments) => scan::run(arguments),
-        Kind::Synth(arguments) => generate::synth(arguments),
-        Kind::Makehuman(arguments) => generate::makehuman(arguments),
-        Kind::Avatars(arguments) => generate::avatars(arguments),
+        Kind::Synth(generate) => generate::synth(generate),
+        Kind::Makehuman { folder, generate } => generate::makehuman(folder, generate),
+        Kind::Avatars { folder, generate } => generate::avatars(folder, generate),
         Kind::Check { dataset } => check(dataset),
     }
 }
