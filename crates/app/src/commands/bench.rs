@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::process::Command;
 
 use clap::Args;
+use snapsnap_base::FileError;
 use snapsnap_base::config::Schema;
 use snapsnap_eval::bench::config::BenchConfig;
 use snapsnap_eval::bench::report::{Bench, Training};
@@ -65,10 +66,8 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let own = variants.iter().filter_map(|(_, variant)| variant.data.as_ref());
     outside_data(output, config.data.folders.iter().chain(own).map(PathBuf::as_path))?;
     // One error instead of one for each setting.
-    if let Some(path) = &config.model.weights
-        && let Err(e) = path.metadata()
-    {
-        return Err(Failure::file(path, format_args!("cannot read: {e}")));
+    if let Some(path) = &config.model.weights {
+        path.metadata().map_err(FileError::read(path))?;
     }
     let folder = ReportFolder::new(output, &inputs(&arguments.config, &variants, &arguments.lpips))?;
     let (mut left_out, mut training, mut measured) = (Vec::new(), Vec::new(), Vec::new());
