@@ -15,8 +15,8 @@ const CELLS: f32 = 160.0;
 /// Offset along the normal, in cells, at which a surface is looked up in the depth map.
 const OFF: f32 = 0.6;
 
-/// For each direction whether it is seen.
-type Seen = [bool; WAYS];
+/// A bit for each direction.
+type Seen = [u64; WAYS / 64];
 
 /// Clusters of nearby vertices that face about the same direction. A cluster is called place.
 struct Places {
@@ -72,7 +72,7 @@ impl Occlusion {
         let cell = ((high - low).max_element() / CELLS).max(f32::MIN_POSITIVE);
         let places = Places::new(positions, normals, faces, cell);
         let ways = ways();
-        let mut seen: Vec<Seen> = vec![[false; WAYS]; places.positions.len()];
+        let mut seen: Vec<Seen> = vec![Seen::default(); places.positions.len()];
         for (chunk, some) in ways[..PAIRS].chunks(AT_ONCE).enumerate() {
             let look = |way: &Vec3| -> Vec<[bool; 2]> {
                 let map = DepthMap::new(*way, middle, (high - low).length(), cell, &places);
@@ -80,9 +80,11 @@ impl Occlusion {
                 places.positions.iter().zip(&places.normals).map(sees).collect()
             };
             let pairs: Vec<Vec<[bool; 2]>> = some.par_iter().map(look).collect();
-            seen.par_iter_mut().enumerate().for_each(|(row, seen)| {
+            seen.par_iter_mut().enumerate().for_each(|(row, bits)| {
                 for (pair, both) in (chunk * AT_ONCE..).zip(&pairs) {
-                    [seen[pair], seen[pair + PAIRS]] = both[row];
+                    for (way, seen) in [pair, pair + PAIRS].into_iter().zip(both[row]) {
+                        bits[way / 64] |= u64::from(seen) << (way % 64);
+                    }
                 }
             });
         }
@@ -96,9 +98,15 @@ impl Occlusion {
         // reflected light. The normals of a place's vertices differ a little.
         let arriving = |(seen, normal): (&Seen, &Vec3)| {
             let mut sides = [Mat3::ZERO; 2];
-            for (way, light) in (0..WAYS).filter(|way| seen[*way]).map(|way| (self.ways[way], light[way])) {
-                let side = &mut sides[usize::from(normal.dot(way) < 0.0)];
-                *side += Mat3::from_cols(way * light.x, way * light.y, way * light.z);
+            for (word, bits) in seen.iter().enumerate() {
+                let mut bits = *bits;
+                while bits != 0 {
+                    let way = 64 * word + bits.trailing_zeros() as usize;
+                    bits &= bits - 1;
+                    let (way, light) = (self.ways[way], light[way]);
+                    let side = &mut sides[usize::from(normal.dot(way) < 0.0)];
+                    *side += Mat3::from_cols(way * light.x, way * light.y, way * light.z);
+                }
             }
             sides
         };
