@@ -184,10 +184,22 @@ fn glb_with_nested_nodes_and_a_texture() {
     assert!(normals[0].z > 0.9, "a mirrored node keeps the outside of its faces: {normals:?}");
 }
 
+/// A PNG with a header of 100,000 × 100,000 pixels.
+fn absurd_png() -> Vec<u8> {
+    let mut bytes = png();
+    bytes[16..20].copy_from_slice(&100_000_u32.to_be_bytes());
+    bytes[20..24].copy_from_slice(&100_000_u32.to_be_bytes());
+    // CRC-32 of the header chunk.
+    bytes[29..33].copy_from_slice(&0x2730_9c9f_u32.to_be_bytes());
+    bytes
+}
+
 /// Corrupt scans and the words that their errors must contain. Others are in `tests/tests/prepare.rs`.
 #[test]
 fn corrupt_scans_are_refused_by_name() {
     let folder = Folder::new();
+    folder.file("absurd.png", absurd_png());
+    folder.file("absurd.mtl", "newmtl a\nmap_Kd absurd.png\n");
     folder.file("known.mtl", "newmtl ä\nKd 1 1 1\n");
     let triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
     let binary = ply("binary_little_endian");
@@ -202,6 +214,7 @@ fn corrupt_scans_are_refused_by_name() {
         ("unknown.obj", format!("mtllib known.mtl\nusemtl zzz\n{triangle}").into(), "material `zzz` is missing"),
         ("faces.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nelement face 1000000000000000\nend_header\n".into(), "no list `vertex_indices`"),
         ("mtl.obj", format!("mtllib no.mtl\n{triangle}").into(), "material file `no.mtl` is missing"),
+        ("absurd.obj", format!("mtllib absurd.mtl\n{triangle}").into(), "is 100000×100000, 28611 MiB in memory, more than 512"),
         ("cut.ply", binary[..binary.len() - 3].into(), "face 1 of 2: `vertex_indices` is missing"),
         ("foreign.ply", b"plyx".into(), "not a PLY file"),
         (
