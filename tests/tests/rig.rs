@@ -89,7 +89,10 @@ fn a_person_gets_the_bones_of_a_person_and_every_position_follows_them() {
     for (row, weights) in character.weights.iter().enumerate() {
         let sum: f32 = weights.iter().map(|(_, weight)| weight).sum();
         assert!((sum - 1.0).abs() < 1e-5, "position {row}: {weights:?}");
-        assert!(weights.iter().all(|(bone, weight)| *weight >= 0.0 && (*bone as usize) < bones.len()), "{weights:?}");
+        assert!(
+            weights.iter().all(|(bone, weight)| *weight >= 0.0 && (*bone as usize) < bones.len()),
+            "{weights:?}"
+        );
     }
 }
 

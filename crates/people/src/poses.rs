@@ -448,11 +448,6 @@ mod tests {
             assert!(parse(&sound[..end]).is_err(), "{end}");
         }
     }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
 
     #[test]
     fn motions_end_as_they_begin_and_never_leap() {

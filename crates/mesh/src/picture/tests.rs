@@ -145,12 +145,12 @@ fn colours_are_converted_to_srgb() {
         encoder.write_image(pixels, 2, 1, kind).expect("encodes");
         bytes
     };
-    let (p3, adobe) = (moxcms::ColorProfile::new_display_p3(), moxcms::ColorProfile::new_adobe_rgb());
+    let (p3, adobe) = (ColorProfile::new_display_p3(), ColorProfile::new_adobe_rgb());
     // Computed with the matrices of the standards: P3 (200, 60, 40) and Adobe RGB (120, 160, 90).
     for (name, profile, stored, expected) in [
         ("P3", &p3, [200, 60, 40], [217, 42, 23]),
         ("Adobe RGB", &adobe, [120, 160, 90], [99, 161, 85]),
-        ("sRGB", &moxcms::ColorProfile::new_srgb(), [200, 60, 40], [200, 60, 40]),
+        ("sRGB", &ColorProfile::new_srgb(), [200, 60, 40], [200, 60, 40]),
     ] {
         let icc = profile.encode().expect("a profile");
         let picture = decoded(&png(&[stored, [77; 3]].concat(), ExtendedColorType::Rgb8, &icc));
@@ -164,7 +164,7 @@ fn colours_are_converted_to_srgb() {
         let found = decoded(&bytes).get_pixel(4, 4).0;
         assert!((0..3).all(|c| found[c].abs_diff(expected[c]) <= 3), "{name} as JPEG: {found:?}");
     }
-    let grey = moxcms::ColorProfile::new_gray_with_gamma(1.8).encode().expect("a profile");
+    let grey = ColorProfile::new_gray_with_gamma(1.8).encode().expect("a profile");
     let picture = decoded(&png(&[100, 255, 0, 128], ExtendedColorType::La8, &grey));
     // (100 / 255) ^ 1.8 = 0.185 is sRGB's 119.
     assert!((117..=121).contains(&picture.get_pixel(0, 0).0[0]), "{:?}", picture.get_pixel(0, 0));
