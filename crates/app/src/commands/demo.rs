@@ -117,8 +117,11 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The photographs, then each rendered view and its ground truth, and the views' degrees and PSNR on the person, dB.
-fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Vec<(f64, f64)>), Failure> {
+/// The degrees of a view, and its PSNR on the person, dB.
+type Agreement = (f64, f64);
+
+/// The photographs, then each rendered view and its ground truth, and how they agree.
+fn comparison(world: &Gaussians) -> Result<(Vec<RgbImage>, Vec<Agreement>), Failure> {
     let side = TRUTH as usize;
     let mut pictures = Vec::new();
     for (name, bytes) in PHOTOGRAPHS {
