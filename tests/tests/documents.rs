@@ -114,7 +114,7 @@ fn look(words: &[String]) {
         }
         ["python", "-m", "snapsnap"] => true,
         ["python", file, ..] => root().join(file).is_file(),
-        ["cargo", "doc", ..] => true,
+        ["cargo", "doc", ..] | ["cargo", "build", ..] => true,
         ["pip", "install", folder] => root().join(folder).join("pyproject.toml").is_file(),
         ["cargo", "install", "--locked", "--path", folder] => {
             root().join(folder).join("Cargo.toml").is_file()

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 /// Crates, lowest layer first, and the crates of the workspace that each may depend on.
-const LAYERS: [(&str, &[&str]); 12] = [
+const LAYERS: [(&str, &[&str]); 13] = [
     ("base", &[]),
     ("splat", &["base"]),
     ("ops", &["base"]),
@@ -13,10 +13,11 @@ const LAYERS: [(&str, &[&str]); 12] = [
     ("net", &["splat", "ops", "base"]),
     ("people", &["mesh", "base"]),
     ("photo", &["net", "ops", "mesh", "splat", "base"]),
+    ("rig", &["photo", "people", "mesh", "splat"]),
     ("data", &["photo", "people", "net", "mesh", "splat", "base"]),
     ("eval", &["data", "photo", "net", "ops", "mesh", "splat", "base"]),
     ("train", &["eval", "data", "people", "net", "ops", "mesh", "splat", "base"]),
-    ("app", &["train", "eval", "data", "photo", "people", "net", "ops", "mesh", "splat", "base"]),
+    ("app", &["train", "eval", "data", "rig", "photo", "people", "net", "ops", "mesh", "splat", "base"]),
     ("python", &["app", "photo", "net", "ops", "mesh", "splat"]),
 ];
 

@@ -1,9 +1,12 @@
 //! The skeleton: joints at fixed places beside the landmarks, and the bones between them.
 
+use std::ops::RangeInclusive;
+
 use glam::{Affine3A, Mat3, Quat, Vec3};
 use snapsnap_mesh::export::Joint;
 use snapsnap_mesh::import;
 
+use crate::body::Body;
 use crate::landmarks::Landmark;
 use crate::weights::Source;
 
@@ -45,8 +48,10 @@ const SURE: f32 = 0.2;
 const THIGH: f32 = 0.24;
 const CALF: f32 = 0.2;
 
-/// Parts of the left limbs: the landmarks of both ends, and the last landmark of the limb.
-const PARTS: [(usize, usize, usize); 4] = [(11, 13, 21), (13, 15, 21), (23, 25, 31), (25, 27, 31)];
+/// Parts of limbs: rows of [`LIMBS`] at both ends and of the last joint, and the limb's largest radius at the far end, in
+/// lengths of the trunk.
+const PARTS: [(usize, usize, usize, f32); 4] =
+    [(1, 2, 3, 0.16), (2, 3, 3, 0.12), (4, 5, 7, 0.2), (5, 6, 7, 0.16)];
 
 /// A bone of a person.
 #[derive(Debug, Clone)]
@@ -68,25 +73,9 @@ impl Bone {
     }
 }
 
-/// The landmarks with limbs of the same lengths on both sides: their means, weighted by certainty.
-fn symmetric(landmarks: &[Landmark]) -> Vec<Landmark> {
-    let mut landmarks = landmarks.to_vec();
-    for (start, end, last) in PARTS {
-        let ways = [0, 1].map(|side| landmarks[end + side].at - landmarks[start + side].at);
-        let sure = [0, 1].map(|side| landmarks[start + side].sure * landmarks[end + side].sure);
-        let [left, right] = ways.map(|way| way.length().max(1e-6));
-        let length = (sure[0] * left + sure[1] * right) / (sure[0] + sure[1]).max(1e-6);
-        for (side, own) in [left, right].into_iter().enumerate() {
-            let step = (length / own - 1.0) * ways[side];
-            (end..=last).step_by(2).for_each(|row| landmarks[row + side].at += step);
-        }
-    }
-    landmarks
-}
-
-/// The bones of a person with these landmarks.
-pub fn bones(landmarks: &[Landmark]) -> Vec<Bone> {
-    let landmarks = symmetric(landmarks);
+/// The bones of a person with these landmarks. Elbows, wrists, knees and ankles go to the middle of the limb, if the body
+/// has one there, and limbs of both sides get the mean of their lengths, weighted by certainty.
+pub fn bones(landmarks: &[Landmark], body: &Body) -> Vec<Bone> {
     let at = |row: usize| landmarks[row].at;
     let middle = |rows: &[usize]| rows.iter().map(|row| at(*row)).sum::<Vec3>() / rows.len() as f32;
     let (shoulders, hips) = (middle(&[11, 12]), middle(&[23, 24]));
@@ -117,6 +106,30 @@ pub fn bones(landmarks: &[Landmark]) -> Vec<Bone> {
     for (side, word) in ["Left", "Right"].into_iter().enumerate() {
         LIMBS.iter().for_each(|row| add(row, side, word));
     }
+    let mut moved = vec![Vec3::ZERO; bones.len()];
+    let mut shift = |bones: &mut [Bone], rows: RangeInclusive<usize>, step: Vec3| {
+        for row in rows {
+            bones[row].ends[0] += step;
+            moved[row] += step;
+        }
+    };
+    for (start, end, last, radius) in PARTS {
+        let ways = [0, 1].map(|side| {
+            let row = |row: usize| TRUNK.len() + side * LIMBS.len() + row;
+            let place = bones[row(end)].ends[0];
+            let along = (place - bones[row(start)].ends[0]).normalize_or(Vec3::NEG_Y);
+            let middle = body.middle(place, along, radius * shoulders.distance(hips)).unwrap_or(place);
+            shift(&mut bones, row(end)..=row(last), middle - place);
+            (middle - bones[row(start)].ends[0], landmarks[LIMBS[end].2[0] + side].sure)
+        });
+        let [left, right] = ways.map(|(way, _)| way.length().max(1e-6));
+        let share = ways[0].1 / (ways[0].1 + ways[1].1).max(1e-6);
+        let length = right + share * (left - right);
+        for (side, own) in [left, right].into_iter().enumerate() {
+            let first = TRUNK.len() + side * LIMBS.len();
+            shift(&mut bones, first + end..=first + last, (length / own - 1.0) * ways[side].0);
+        }
+    }
     // A bone ends at the first of the bones that it bears.
     for row in (1..bones.len()).rev() {
         let (start, parent) = (bones[row].ends[0], bones[row].parent.expect("only the hips have none"));
@@ -125,8 +138,8 @@ pub fn bones(landmarks: &[Landmark]) -> Vec<Bone> {
     }
     for (row, side) in ENDS.iter().flat_map(|row| [(row, 0), (row, 1)]) {
         let name = format!("{PREFIX}{}{}", ["Left", "Right"][side], row.1);
-        let bone = bones.iter_mut().find(|bone| bone.name == name).expect("a limb of this name");
-        bone.ends[1] = place(row, side);
+        let bone = bones.iter().position(|bone| bone.name == name).expect("a limb of this name");
+        bones[bone].ends[1] = place(row, side) + moved[bone];
     }
     bones[5].ends[1] = bones[5].ends[0] + SKULL * frame.y_axis;
     bones

@@ -1,5 +1,6 @@
 //! Skeletons and skin weights of people made of Gaussians, and their poses (docs/method.md, "Skeletons").
 
+mod body;
 mod bones;
 mod landmarks;
 mod posed;
@@ -7,13 +8,14 @@ mod weights;
 
 use glam::{Affine3A, Vec3};
 use snapsnap_mesh::export::{Clip, Skin};
-use snapsnap_mesh::fuse::{FuseError, body};
+use snapsnap_mesh::fuse::{self, FuseError};
 use snapsnap_mesh::mesh::Mesh;
 use snapsnap_people::poses::Motion;
 use snapsnap_people::{Placed, Pose, avatars};
 use snapsnap_splat::scene::Loaded;
 use snapsnap_splat::{Gaussians, SplatError};
 
+use body::Body;
 pub use bones::Bone;
 pub use posed::pose_mesh;
 use weights::Field;
@@ -52,10 +54,11 @@ impl Rig {
     /// # Errors
     /// [`RigError`].
     pub fn new(scene: &Loaded, mesh: &Mesh) -> Result<Self, RigError> {
-        let (centre, size) = body(&scene.gaussians)?;
+        let (centre, size) = fuse::body(&scene.gaussians)?;
         let landmarks = landmarks::landmarks(scene, [centre, size])?.ok_or(RigError::Nobody)?;
-        let bones = bones::bones(&landmarks);
-        let field = Field::new(mesh, &bones::sources(&bones), bones.len()).ok_or(RigError::Hollow)?;
+        let body = Body::new(mesh);
+        let bones = bones::bones(&landmarks, &body);
+        let field = Field::new(body, &bones::sources(&bones), bones.len()).ok_or(RigError::Hollow)?;
         Ok(Self { bones, field })
     }
 

@@ -8,12 +8,9 @@ use std::collections::{BinaryHeap, VecDeque};
 use glam::{IVec3, Vec3};
 use rayon::prelude::*;
 use snapsnap_mesh::import::Weights;
-use snapsnap_mesh::mesh::Mesh;
 
-/// Cells along the longest side of the body's box.
-const CELLS: f32 = 180.0;
-/// Cells around the body, at which Gaussians may lie.
-const BORDER: i32 = 3;
+use crate::body::{Body, Grid, around};
+
 /// Heat that flows from the nearest bone, beside the heat that flows between cells a bone's distance apart.
 const HEAT: f32 = 1.0;
 /// Rounds of conjugate gradients. Heat spreads by about the distance to the bone, which is some cells.
@@ -37,25 +34,18 @@ pub struct Source {
 /// Skin weights everywhere in and around a body.
 #[derive(Debug, Clone)]
 pub struct Field {
-    /// Centre of the first cell, and edge of a cell, metres.
-    origin: Vec3,
-    cell: f32,
-    counts: IVec3,
+    grid: Grid,
     /// By cell, x first: row of `weights` of the nearest cell inside.
     rows: Vec<u32>,
     weights: Vec<Weights>,
 }
 
 impl Field {
-    /// The field of a closed mesh. `bones` is the number of bones. `None` if no bone lies in the mesh.
-    pub fn new(mesh: &Mesh, sources: &[Source], bones: usize) -> Option<Self> {
-        let (low, high) = mesh.bounds();
-        let cell = (high - low).max_element() / CELLS;
-        let origin = low - BORDER as f32 * cell;
-        let counts = ((high - low) / cell).ceil().as_ivec3() + 2 * BORDER;
-        let cells = counts.as_usizevec3().element_product();
-        let mut field = Self { origin, cell, counts, rows: vec![NONE; cells], weights: Vec::new() };
-        let mut inside = field.inside(mesh);
+    /// The field of a body. `bones` is the number of bones. `None` if no bone lies in the body.
+    pub fn new(body: Body, sources: &[Source], bones: usize) -> Option<Self> {
+        let Body { grid, mut inside } = body;
+        let cells = grid.counts.as_usizevec3().element_product();
+        let mut field = Self { grid, rows: vec![NONE; cells], weights: Vec::new() };
         field.number(&inside);
         let mut nearest = field.nearest(&inside, sources);
         // From cells of their own no way leads to a bone.
@@ -79,15 +69,15 @@ impl Field {
 
     /// The weights at a place: those of the eight cells around it.
     pub fn at(&self, place: Vec3) -> Weights {
-        let last = (self.counts - 2).as_vec3();
-        let at = ((place - self.origin) / self.cell).clamp(Vec3::ZERO, last);
-        let low = at.as_ivec3().min(self.counts - 2);
+        let last = (self.grid.counts - 2).as_vec3();
+        let at = ((place - self.grid.origin) / self.grid.cell).clamp(Vec3::ZERO, last);
+        let low = at.as_ivec3().min(self.grid.counts - 2);
         let share = at - low.as_vec3();
         let mut sums: Vec<(u32, f32)> = Vec::with_capacity(16);
         for corner in 0..8 {
             let step = IVec3::new(corner & 1, corner >> 1 & 1, corner >> 2);
             let parts = Vec3::select(step.cmpeq(IVec3::ONE), share, 1.0 - share);
-            let weights = &self.weights[self.rows[self.index(low + step)] as usize];
+            let weights = &self.weights[self.rows[self.grid.index(low + step)] as usize];
             for (bone, weight) in weights.iter().filter(|(_, weight)| *weight > 0.0) {
                 let weight = weight * parts.element_product();
                 match sums.iter_mut().find(|(known, _)| known == bone) {
@@ -99,65 +89,18 @@ impl Field {
         largest(sums)
     }
 
-    fn index(&self, at: IVec3) -> usize {
-        ((at.z * self.counts.y + at.y) * self.counts.x + at.x) as usize
-    }
-
-    fn place(&self, cell: usize) -> IVec3 {
-        let (cell, IVec3 { x, y, .. }) = (cell as i32, self.counts);
-        IVec3::new(cell % x, cell / x % y, cell / (x * y))
-    }
-
-    /// The cell that contains a place.
-    fn containing(&self, place: Vec3) -> IVec3 {
-        ((place - self.origin) / self.cell).round().as_ivec3().clamp(IVec3::ZERO, self.counts - 1)
-    }
-
-    /// Cells whose centres are inside of the mesh: along z, the inside lies between the first and the second triangle, and
-    /// so on.
-    fn inside(&self, mesh: &Mesh) -> Vec<usize> {
-        // Off the middle, so that no line meets an edge of triangles between cells.
-        let shift = Vec3::new(1.3e-3, 2.9e-3, 0.0);
-        let mut crossings = vec![Vec::new(); (self.counts.x * self.counts.y) as usize];
-        for face in &mesh.faces {
-            let corner = |row: u32| (mesh.positions[row as usize] - self.origin) / self.cell - shift;
-            let [a, b, c] = face.positions.map(corner);
-            let [low, high] = [a.min(b).min(c).ceil().as_ivec3(), a.max(b).max(c).floor().as_ivec3()];
-            let (u, v) = (b - a, c - a);
-            let area = u.x * v.y - u.y * v.x;
-            for (x, y) in (low.y..=high.y).flat_map(|y| (low.x..=high.x).map(move |x| (x, y))) {
-                let d = Vec3::new(x as f32, y as f32, 0.0) - a;
-                let (s, t) = ((d.x * v.y - d.y * v.x) / area, (u.x * d.y - u.y * d.x) / area);
-                if s >= 0.0 && t >= 0.0 && s + t <= 1.0 {
-                    crossings[(y * self.counts.x + x) as usize].push(a.z + s * u.z + t * v.z);
-                }
-            }
-        }
-        let column = |(column, mut depths): (usize, Vec<f32>)| {
-            depths.sort_by(f32::total_cmp);
-            let cells = depths
-                .as_chunks::<2>()
-                .0
-                .iter()
-                .flat_map(|[from, to]| from.ceil() as i32..=to.floor() as i32);
-            let sheet = (self.counts.x * self.counts.y) as usize;
-            cells.map(move |z| z as usize * sheet + column).collect::<Vec<_>>()
-        };
-        crossings.into_iter().enumerate().flat_map(column).collect()
-    }
-
     /// For every cell inside its nearest source and the length of the way to it through the body, metres.
     fn nearest(&self, inside: &[usize], sources: &[Source]) -> Vec<(usize, f32)> {
         let mut nearest = vec![(0, f32::INFINITY); inside.len()];
         // Distances as bits: those of numbers above 0 have the same order.
         let mut open = BinaryHeap::new();
         for (source, Source { ends: [from, to], .. }) in sources.iter().enumerate() {
-            let steps = (from.distance(*to) / (0.5 * self.cell)).ceil().max(1.0) as usize;
+            let steps = (from.distance(*to) / (0.5 * self.grid.cell)).ceil().max(1.0) as usize;
             for step in 0..=steps {
                 let place = from.lerp(*to, step as f32 / steps as f32);
-                let row = self.rows[self.index(self.containing(place))];
+                let row = self.rows[self.grid.index(self.grid.containing(place))];
                 if row != NONE {
-                    let centre = self.origin + self.cell * self.place(inside[row as usize]).as_vec3();
+                    let centre = self.grid.centre(inside[row as usize]);
                     open.push(Reverse((centre.distance(place).to_bits(), row, source)));
                 }
             }
@@ -168,10 +111,10 @@ impl Field {
                 continue;
             }
             nearest[row as usize] = (source, length);
-            let at = self.place(inside[row as usize]);
+            let at = self.grid.place(inside[row as usize]);
             for (step, distance) in around() {
-                let next = self.rows[self.index(at + step)];
-                let length = length + self.cell * distance;
+                let next = self.rows[self.grid.index(at + step)];
+                let length = length + self.grid.cell * distance;
                 if next != NONE && length < nearest[next as usize].1 {
                     open.push(Reverse((length.to_bits(), next, source)));
                 }
@@ -192,9 +135,10 @@ impl Field {
         let steps = [IVec3::X, IVec3::Y, IVec3::Z, IVec3::NEG_X, IVec3::NEG_Y, IVec3::NEG_Z];
         let neighbours: Vec<[u32; 6]> = inside
             .iter()
-            .map(|cell| steps.map(|step| self.rows[self.index(self.place(*cell) + step)]))
+            .map(|cell| steps.map(|step| self.rows[self.grid.index(self.grid.place(*cell) + step)]))
             .collect();
-        let heat = |(_, length): &(usize, f32)| HEAT * (self.cell / length.max(0.5 * self.cell)).powi(2);
+        let heat =
+            |(_, length): &(usize, f32)| HEAT * (self.grid.cell / length.max(0.5 * self.grid.cell)).powi(2);
         let heats: Vec<f32> = nearest.iter().map(heat).collect();
         let share = |bone: usize, (source, length): (usize, f32)| {
             let source = &sources[source];
@@ -220,13 +164,13 @@ impl Field {
         let mut open: VecDeque<usize> =
             (0..self.rows.len()).filter(|cell| self.rows[*cell] != NONE).collect();
         while let Some(cell) = open.pop_front() {
-            let at = self.place(cell);
+            let at = self.grid.place(cell);
             for (step, _) in around() {
                 let next = at + step;
-                if next.cmplt(IVec3::ZERO).any() || next.cmpge(self.counts).any() {
+                if next.cmplt(IVec3::ZERO).any() || next.cmpge(self.grid.counts).any() {
                     continue;
                 }
-                let next = self.index(next);
+                let next = self.grid.index(next);
                 if self.rows[next] == NONE {
                     self.rows[next] = self.rows[cell];
                     open.push_back(next);
@@ -234,12 +178,6 @@ impl Field {
             }
         }
     }
-}
-
-/// Steps to the 26 neighbours of a cell, with their lengths in cells.
-fn around() -> impl Iterator<Item = (IVec3, f32)> {
-    let steps = (-1..=1).flat_map(|z| (-1..=1).flat_map(move |y| (-1..=1).map(move |x| IVec3::new(x, y, z))));
-    steps.filter(|step| *step != IVec3::ZERO).map(|step| (step, step.as_vec3().length()))
 }
 
 /// Solves (L + H) w = H p by conjugate gradients, with the diagonal as preconditioner.
@@ -297,6 +235,8 @@ fn largest(mut sums: Vec<(u32, f32)>) -> Weights {
 
 #[cfg(test)]
 mod tests {
+    use snapsnap_mesh::mesh::Mesh;
+
     use super::*;
 
     /// A closed mesh around cubes of 3 cm.
@@ -337,7 +277,7 @@ mod tests {
             source(1, [[1.0, 20.0], [1.0, 0.5]]),
             source(2, [[4.0, 20.0], [4.0, 0.5]]),
         ];
-        let field = Field::new(&mesh, &sources, 3).expect("bones within");
+        let field = Field::new(Body::new(&mesh), &sources, 3).expect("bones within");
         let share = |x: f32, y: f32, bone: u32| {
             let weights = field.at(0.03 * Vec3::new(x, y, 1.0));
             weights.iter().filter(|(row, _)| *row == bone).map(|(_, weight)| weight).sum::<f32>()
@@ -352,6 +292,6 @@ mod tests {
             let sum: f32 = (0..3).map(|bone| share(x, y, bone)).sum();
             assert!((sum - 1.0).abs() < 1e-5, "{x} {y}: {sum}");
         }
-        assert!(Field::new(&mesh, &[source(0, [[12.0, 2.0], [12.0, 3.0]])], 1).is_none());
+        assert!(Field::new(Body::new(&mesh), &[source(0, [[12.0, 2.0], [12.0, 3.0]])], 1).is_none());
     }
 }

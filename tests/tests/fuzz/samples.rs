@@ -148,6 +148,7 @@ pub fn make(folder: &Path, name: &str) {
         "mesh_ascii.ply" => put(&path, mesh_ply(&pyramid(folder), Format::Ascii)),
         // Scans with the parameters of their bodies.
         "scans" => {
+            make(&path, "a.obj");
             for subject in ["protocol2", "protocol4", "big_endian", "numpy2"] {
                 let parameters = format!("{subject}.pkl");
                 copy(&format!("crates/data/tests/smplx/{parameters}"), &path.join(parameters));

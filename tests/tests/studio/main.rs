@@ -8,7 +8,7 @@ use std::io::{BufRead, Cursor, Read, Write};
 use std::net::{Shutdown, TcpStream};
 use std::path::Path;
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use image::{DynamicImage, GrayImage, ImageFormat, Luma};

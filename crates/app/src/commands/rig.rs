@@ -13,7 +13,7 @@ use snapsnap_splat::scene::{Kind, Loaded, Stored};
 
 use super::convert::read;
 use super::mesh::{SurfaceArguments, Target};
-use crate::failure::{Failure, bail};
+use crate::failure::Failure;
 use crate::output::{self, check_outputs};
 use crate::progress::Progress;
 use crate::{device, say};
@@ -28,11 +28,11 @@ pub struct Arguments {
     /// Output file: .glb, a mesh with skeleton and skin; or with --pose Gaussians: .ply, .spz or .sog.
     #[arg(short, long)]
     output: PathBuf,
-    /// Another pose: t or a, as game engines expect it; a motion file, of which --frame is taken; or a character with the
-    /// joint names of Mixamo or MakeHuman.
-    #[arg(long, value_name = "t|a|FILE.bvh|FILE.glb")]
+    /// Another pose: t or a, as game engines expect it; a motion as of --motion, of which --frame is taken; or a character
+    /// with the joint names of Mixamo or MakeHuman.
+    #[arg(long, value_name = "t|a|MOTION|FILE.glb")]
     pose: Option<PathBuf>,
-    /// Frame of the motion file of --pose.
+    /// Frame of the motion of --pose.
     #[arg(long, value_name = "N", default_value_t = 0)]
     frame: usize,
     /// Motion that goes into the GLB as an animation: idle, walk, wave or a file. May be repeated.
@@ -112,10 +112,13 @@ pub fn skeleton(scene: &Loaded, mesh: &Mesh, name: &Path) -> Result<Rig, Failure
     Ok(rig)
 }
 
-/// The motion that `--motion` names.
+/// The motion that `--motion` or `--pose` names.
 fn read_motion(path: &Path) -> Result<Motion, Failure> {
     if let Some(own) = path.to_str().and_then(Motion::named) {
         return Ok(own);
+    }
+    if path.extension().is_none_or(|extension| !extension.eq_ignore_ascii_case("bvh")) {
+        return Err(Failure::file(path, "is no .bvh, and no pose or motion of this name exists"));
     }
     let motion = poses::read(path)?;
     if motion.poses.is_empty() {
@@ -137,10 +140,7 @@ fn read_pose(path: &Path, frame: usize) -> Result<Pose, Failure> {
         let rigged = import::read_rigged(path)?;
         return poses::of_bones(&rigged.bones).map_err(|e| Failure::file(path, e));
     }
-    if extension != "bvh" {
-        bail!("--pose {}: expected t, a, a file .bvh or a file .glb", path.display());
-    }
-    let mut motion = poses::read(path)?;
+    let mut motion = read_motion(path)?;
     let frames = motion.poses.len();
     if frame >= frames {
         return Err(Failure::file(
