@@ -197,6 +197,13 @@ pub fn refused(command: &mut Command) -> String {
     ended_with(2, command)
 }
 
+/// Asserts that a message has all of these parts.
+pub fn assert_says(message: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(message.contains(part), "{part}: {message}");
+    }
+}
+
 /// The command under a limit of `ulimit`: `-v` kilobytes of memory, or files of `-f` blocks, which imitate a full disk.
 pub fn limited(command: &Command, limit: &str) -> Command {
     let mut shell = Command::new("sh");

@@ -10,7 +10,7 @@ use snapsnap_mesh::mesh::Mesh;
 use snapsnap_people::avatars::{Avatars, Character};
 use snapsnap_tests::character::{CLOTH, SKIN, character};
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{refused, shared_folder, succeed};
+use snapsnap_tests::{assert_says, refused, shared_folder, succeed};
 
 /// Settings of small and few views.
 const SMALL: &str = "--set views.count=4 --set views.resolution=64";
@@ -130,8 +130,7 @@ fn characters_become_a_data_set_whose_splits_share_no_person() {
     for split in ["train", "val", "test"] {
         succeed(&mut prepare(people.path(), &format!("--subjects 2 --split {split} -o people")));
     }
-    let report = succeed(&mut place.run("prepare check people"));
-    assert!(report.contains("6 subjects, 24 views: no fault"), "{report}");
+    assert_says(&succeed(&mut place.run("prepare check people")), &["6 subjects, 24 views: no fault"]);
     // Files of 18 people: two for test, two for val.
     let of = |part: fn(usize) -> bool| Avatars::open(people.path(), part).is_ok();
     assert!(of(|person| person == 0) && of(|person| person == 17) && !of(|person| person == 18));

@@ -5,7 +5,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{ended_with, limited, names, refused, root, sample, succeed};
+use snapsnap_tests::{assert_says, ended_with, limited, names, refused, root, sample, succeed};
 
 /// A place with a folder `photographs`.
 fn place() -> Workplace {
@@ -29,8 +29,7 @@ fn reconstruct(place: &Workplace, line: &str) -> Command {
 
 /// Runs a command that fails for some people (exit code 1). Returns the rows of the list of failures.
 fn failed(place: &Workplace, command: &mut Command, list: &str) -> Vec<[String; 2]> {
-    let said = ended_with(1, command);
-    assert!(said.contains(list), "{said}");
+    assert_says(&ended_with(1, command), &[list]);
     let mut rows = csv::Reader::from_path(place.path(list)).expect("a list");
     assert_eq!(rows.headers().expect("headers"), vec!["name", "error"]);
     rows.deserialize().map(|row| row.expect("a row")).collect()
@@ -64,8 +63,7 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
     place.write("out/anna.ply", "kept");
     // A power failure may leave an empty file.
     place.write("out/other.ply", "");
-    let said = succeed(&mut all());
-    assert!(said.contains("3 made"), "{said}");
+    assert_says(&succeed(&mut all()), &["3 made"]);
     assert!(place.read("out/other.ply") == other);
     assert_eq!(place.read("out/anna.ply"), b"kept");
     assert_eq!(made(), ["=bad.ply", "anna.ply", "lost.ply", "other.ply", "pairs.config.toml", "twice.ply"]);
@@ -80,8 +78,7 @@ fn a_table_of_pairs_becomes_the_people_of_single_calls() {
     assert!(succeed(all().args(["--weights", "w.safetensors"])).contains("0 made"));
     *bytes.last_mut().expect("bytes") ^= 1;
     place.write("w.safetensors", &bytes);
-    let said = refused(all().args(["--weights", "w.safetensors"]));
-    assert!(said.contains("other settings"), "{said}");
+    assert_says(&refused(all().args(["--weights", "w.safetensors"])), &["other settings"]);
 }
 
 #[test]
@@ -181,8 +178,7 @@ fn wrong_batches_are_refused() {
         let said = refusal(line);
         assert!(said.contains(expected), "{line}: {said}");
     }
-    let said = refused(&mut place.run("convert out out"));
-    assert!(said.contains("folder of the inputs"), "{said}");
+    assert_says(&refused(&mut place.run("convert out out")), &["folder of the inputs"]);
 }
 
 /// A full disk ends the command, since the next people could not be written either. An interrupted command continues.
@@ -194,8 +190,7 @@ fn batches_end_on_a_full_disk_and_go_on_after_a_kill() {
         pair(&place, &format!("{i}_front.png"), &format!("{i}_back.png"));
     }
     let all = || reconstruct(&place, "--pairs photographs -o out");
-    let said = refused(&mut limited(&all(), "-f 50"));
-    assert!(said.contains("cannot write"), "{said}");
+    assert_says(&refused(&mut limited(&all(), "-f 50")), &["cannot write"]);
     assert_eq!(names(&place.path("out")), ["pairs.config.toml"]);
     let file = |i: usize| place.path(&format!("out/{i}.ply"));
     let mut child = all().stderr(Stdio::null()).spawn().expect("starts");

@@ -2,7 +2,9 @@
 
 use serde_json::Value;
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{ended_with, fill_weights, limited, names, refused, root, snapsnap, succeed};
+use snapsnap_tests::{
+    assert_says, ended_with, fill_weights, limited, names, refused, root, snapsnap, succeed,
+};
 
 #[test]
 fn the_doctor_names_devices_weights_and_what_mends() {
@@ -61,8 +63,7 @@ fn a_report_that_the_disk_does_not_take_is_a_failure() {
 fn values_that_are_not_finite_are_no_sound_weights() {
     let place = Workplace::with_weights();
     fill_weights(&place.path("w"), f32::NAN);
-    let said = refused(&mut place.run("doctor --weights w"));
-    assert!(said.contains("not finite"), "{said}");
+    assert_says(&refused(&mut place.run("doctor --weights w")), &["not finite"]);
 }
 
 #[test]
@@ -133,9 +134,7 @@ fn shells_get_their_completions() {
 #[test]
 fn without_arguments_a_newcomer_reads_the_first_steps() {
     let message = refused(&mut snapsnap());
-    for part in ["First steps", "snapsnap demo", "snapsnap reconstruct", "snapsnap view"] {
-        assert!(message.contains(part), "{part}: {message}");
-    }
+    assert_says(&message, &["First steps", "snapsnap demo", "snapsnap reconstruct", "snapsnap view"]);
     assert!(!message.contains('\u{1b}'));
 }
 

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use image::{DynamicImage, GrayImage, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use snapsnap_tests::workplace::{Workplace, person};
-use snapsnap_tests::{Numbers, fill_weights, refused, root, shared_folder, succeed};
+use snapsnap_tests::{Numbers, assert_says, fill_weights, refused, root, shared_folder, succeed};
 
 /// Properties and rows of a binary PLY.
 fn read_ply(path: &Path) -> (Vec<String>, Vec<Vec<f32>>) {
@@ -54,8 +54,7 @@ fn turntables_are_animations_sheets_and_folders() {
     for name in ["turn.gif", "turn.png", "turn"] {
         // The height of the random weights' blob.
         let line = format!("front.png back.png --height 0.16 -v --turntable {name}");
-        let printed = succeed(&mut place.reconstruct(&line));
-        assert!(printed.contains("turntable"), "{printed}");
+        assert_says(&succeed(&mut place.reconstruct(&line)), &["turntable"]);
     }
     let gif = fs::read(place.path("turn.gif")).expect("animation");
     assert!(gif.starts_with(b"GIF89a"));

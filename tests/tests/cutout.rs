@@ -8,7 +8,7 @@ use snapsnap_net::blazepose::{BlazePose, Pose};
 use snapsnap_net::u2net::U2Net;
 use snapsnap_net::weights::Source;
 use snapsnap_tests::sample::{over, paths, picture, reconstruct};
-use snapsnap_tests::{data, refused, root, succeed};
+use snapsnap_tests::{assert_says, data, refused, root, succeed};
 
 /// A wall that gets darker to the right, a window, a floor, and noise.
 fn room(x: u32, y: u32) -> [f32; 3] {
@@ -151,8 +151,7 @@ fn alpha_channels_win_unless_the_network_is_asked_for() {
     };
     assert!(alpha(&cutouts.join("front.png")) == alpha(&photographs[0]), "the alpha channel is the mask");
     let mut network = reconstruct(temporary.path(), &photographs);
-    let said = succeed(network.args(["-v", "--cutout", "network"]));
-    assert!(said.contains("cut out by the network"), "{said}");
+    assert_says(&succeed(network.args(["-v", "--cutout", "network"])), &["cut out by the network"]);
 }
 
 #[test]
@@ -170,7 +169,6 @@ fn what_cannot_be_cut_out_is_refused() {
         RgbImage::from_pixel(200, 300, Rgb([180, 170, 160])).save(&path).expect("written");
         path
     });
-    let nobody = refused(&mut reconstruct(temporary.path(), &empty));
-    assert!(nobody.contains("a.png") && nobody.contains("no person was found"), "{nobody}");
+    assert_says(&refused(&mut reconstruct(temporary.path(), &empty)), &["a.png", "no person was found"]);
     assert!(!temporary.path().join("human.ply").exists());
 }

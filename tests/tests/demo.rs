@@ -8,7 +8,7 @@ use snapsnap_net::config::{RegressorConfig, RotationFrame};
 use snapsnap_net::weights::{Source, WeightFile, save};
 use snapsnap_splat::scene;
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{names, root, succeed};
+use snapsnap_tests::{assert_says, names, root, succeed};
 
 /// Least PSNR on the person in unseen views. The photographs as flat cut-outs have at most 15 dB
 /// (docs/notes/evaluation.md).
@@ -49,8 +49,7 @@ fn a_demo_is_made_of_the_sample_pair_and_looks_like_the_person() {
     scene::read(&folder.join("human.ply"), &burn::tensor::Device::flex()).expect("a PLY");
     fs::create_dir(place.path("mine")).expect("a folder");
     place.write("mine/human.ply", "mine");
-    let message = place.refusal(&mut place.run("demo -o mine"));
-    assert!(message.contains("human.ply") && message.contains("another folder"), "{message}");
+    assert_says(&place.refusal(&mut place.run("demo -o mine")), &["human.ply", "another folder"]);
 }
 
 #[test]

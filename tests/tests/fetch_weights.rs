@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::{Arc, Mutex};
 
-use snapsnap_tests::{data, ended_with, refused, snapsnap, succeed};
+use snapsnap_tests::{assert_says, data, ended_with, refused, snapsnap, succeed};
 
 const FILE: &str = "lpips-alex-v0.1.pth";
 
@@ -149,15 +149,13 @@ fn what_is_not_the_published_file_is_not_kept() {
 fn a_server_that_refuses_or_stays_short_is_told() {
     let temporary = tempfile::tempdir().expect("a folder");
     let (address, asked) = server(|_, _| whole("404 Not Found", b"no"));
-    let said = ended_with(1, &mut fetch(&address, temporary.path()));
-    assert!(said.contains("404"), "{said}");
+    assert_says(&ended_with(1, &mut fetch(&address, temporary.path())), &["404"]);
     assert_eq!(asked.lock().expect("unharmed").len(), 1, "what is refused is not asked for again");
     assert_eq!(fs::read_dir(temporary.path()).expect("lists").count(), 0, "nothing is left");
     // A server that stops at half: the first bytes are kept for the next run.
     let body = published();
     let (address, _) = server(move |number, first| ranged(&body, first, if number == 0 { 3000 } else { 0 }));
-    let said = ended_with(1, &mut fetch(&address, temporary.path()));
-    assert!(said.contains("3000 of 6009 bytes are kept"), "{said}");
+    assert_says(&ended_with(1, &mut fetch(&address, temporary.path())), &["3000 of 6009 bytes are kept"]);
     let part = fs::read(temporary.path().join(format!("{FILE}.part"))).expect("kept");
     assert_eq!(part, published()[..3000]);
     // No server.
@@ -173,8 +171,7 @@ fn a_server_that_goes_round_in_circles_is_left() {
         None => whole("200 OK", &published()[..100]),
         Some(_) => whole("416 Range Not Satisfiable", b""),
     });
-    let said = ended_with(1, &mut fetch(&address, temporary.path()));
-    assert!(said.contains("of 6009 bytes are kept"), "{said}");
+    assert_says(&ended_with(1, &mut fetch(&address, temporary.path())), &["of 6009 bytes are kept"]);
     assert!(asked.lock().expect("unharmed").len() < 12, "{asked:?}");
 }
 
@@ -205,6 +202,5 @@ fn a_folder_is_a_mirror_too() {
     let empty = tempfile::tempdir().expect("a folder");
     let said = refused(&mut fetch(&empty.path().display().to_string(), &temporary.path().join("b")));
     assert!(said.contains(FILE) && said.contains("cannot read"), "{said}");
-    let said = refused(&mut fetch("nowhere", temporary.path()));
-    assert!(said.contains("neither a folder nor an address"), "{said}");
+    assert_says(&refused(&mut fetch("nowhere", temporary.path())), &["neither a folder nor an address"]);
 }

@@ -11,7 +11,7 @@ use snapsnap_splat::{Camera, Gaussians, RenderOptions, render};
 use snapsnap_tests::character::glb;
 use snapsnap_tests::ply::{Format, cloud, ply_bytes};
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{Numbers, data, ended_with, refused, relative_error, succeed, values};
+use snapsnap_tests::{Numbers, assert_says, data, ended_with, refused, relative_error, succeed, values};
 
 /// A PLY of `n` Gaussians with spherical harmonics of degree 1.
 fn ply(n: usize, bad: Option<usize>) -> Vec<u8> {
@@ -154,8 +154,7 @@ fn colours_that_are_not_finite_are_kept() {
 fn gaussians_go_into_an_spz_and_back_within_its_steps() {
     let place = Workplace::empty();
     place.write("a.ply", ply(500, None));
-    let said = succeed(&mut place.run("convert a.ply a.spz"));
-    assert!(said.contains("500 Gaussians of SH degree 1"), "{said}");
+    assert_says(&succeed(&mut place.run("convert a.ply a.spz")), &["500 Gaussians of SH degree 1"]);
     succeed(&mut place.run("convert a.spz b.ply"));
     let [small, back] = ["a.spz", "b.ply"].map(|name| place.read(name).len());
     assert!(3 * small < back, "{small} {back}");
@@ -187,8 +186,7 @@ fn what_an_spz_holds_badly_is_told() {
     let gaussians = scene::read(&place.path("a.ply"), &Device::flex()).expect("read").gaussians;
     let moved = Gaussians { means: gaussians.means.clone() + 1e6, ..gaussians };
     scene::write(&moved, &place.path("b.ply")).expect("written");
-    let said = succeed(&mut place.run("convert b.ply b.spz"));
-    assert!(said.contains("centres are kept in steps of 125.0 mm"), "{said}");
+    assert_says(&succeed(&mut place.run("convert b.ply b.spz")), &["centres are kept in steps of 125.0 mm"]);
     assert!(!succeed(&mut place.run("convert a.ply b.spz")).contains("steps"));
 }
 
@@ -196,8 +194,7 @@ fn what_an_spz_holds_badly_is_told() {
 fn a_ply_becomes_a_ply_of_the_same_numbers_without_what_is_not_finite() {
     let place = Workplace::empty();
     place.write("a.ply", ply(20, Some(7)));
-    let said = ended_with(0, &mut place.run("convert a.ply b.PLY"));
-    assert!(said.contains("1 Gaussians were left out"), "{said}");
+    assert_says(&ended_with(0, &mut place.run("convert a.ply b.PLY")), &["1 Gaussians were left out"]);
     let mut expected = Stored::read(&place.path("a.ply")).expect("read");
     assert_eq!(expected.drop_undrawable(), 1);
     let found = Stored::read(&place.path("b.PLY")).expect("read");
@@ -291,8 +288,7 @@ fn a_sog_has_the_clouds_values_in_its_steps() {
     let place = Workplace::empty();
     let n = 300;
     place.write("a.ply", ply_bytes(&cloud(n, 1), Format::Little, "", b""));
-    let said = succeed(&mut place.run("convert a.ply a.sog"));
-    assert!(said.contains("degree 1 became degree 0"), "{said}");
+    assert_says(&succeed(&mut place.run("convert a.ply a.sog")), &["degree 1 became degree 0"]);
     succeed(&mut place.run("convert a.ply b.sog"));
     assert!(place.read("a.sog") == place.read("b.sog"), "the same bytes again");
 
@@ -375,8 +371,7 @@ fn every_command_draws_the_same_gaussians() {
     // Rows of zeros have no rotation.
     write("zeros.ply", &|i, property, value| if i < 3 && property.starts_with("rot") { 0.0 } else { value });
     for command in ["render zeros.ply --orbit 1 --size 8 --raw raw", "convert zeros.ply less.ply"] {
-        let said = ended_with(0, &mut place.run(command));
-        assert!(said.contains("zeros.ply: 3 Gaussians were left out"), "{said}");
+        assert_says(&ended_with(0, &mut place.run(command)), &["zeros.ply: 3 Gaussians were left out"]);
     }
 }
 

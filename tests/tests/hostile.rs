@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use snapsnap_tests::ply::balls;
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{files, limited, refused, root, succeed};
+use snapsnap_tests::{assert_says, files, limited, refused, root, succeed};
 
 const INPUT: &str = "is an input of this command and would be overwritten";
 const TWICE: &str = "is given for two outputs";
@@ -109,8 +109,7 @@ fn links_to_inputs_and_outputs_are_followed() {
     assert!(message.contains(TWICE), "{message}");
     fs::create_dir(place.path("d")).expect("folder");
     symlink(place.path("human.ply"), place.path("d/001.png")).expect("links");
-    let message = place.refusal(&mut place.run("render human.ply --device cpu --orbit 2 -o d"));
-    assert!(message.contains(INPUT), "{message}");
+    assert_says(&place.refusal(&mut place.run("render human.ply --device cpu --orbit 2 -o d")), &[INPUT]);
 }
 
 /// Files that a command writes where it reads them: cameras stay, pictures are replaced, and a run is repeated.
@@ -213,8 +212,7 @@ fn a_reconstruction_that_memory_cannot_hold_is_refused_with_both_figures() {
     let place = Workplace::with_weights();
     // The process's memory limit counts if it is below the machine's memory.
     let command = place.reconstruct("front.png back.png --set network.resolution=4096");
-    let message = refused(&mut limited(&command, "-v 6000000"));
-    assert!(message.contains("needs 8.6 GB") && message.contains("this process can have"), "{message}");
+    assert_says(&refused(&mut limited(&command, "-v 6000000")), &["needs 8.6 GB", "this process can have"]);
 }
 
 #[test]

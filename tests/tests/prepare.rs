@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use snapsnap_tests::{files, limited, refused, root, shared_folder, snapsnap, succeed};
+use snapsnap_tests::{assert_says, files, limited, refused, root, shared_folder, snapsnap, succeed};
 
 /// Settings of small and few views.
 const SMALL: [&str; 4] = ["--set", "views.count=4", "--set", "views.resolution=64"];
@@ -27,8 +27,7 @@ fn synthetic_people_become_a_data_set_that_has_no_fault() {
     let temporary = tempfile::tempdir().expect("temporary folder");
     let (folder, sheet) = (temporary.path().join("people"), temporary.path().join("sheet.png"));
     succeed(synth(&folder, "3").arg("--save-scans").arg("--preview").arg(&sheet));
-    let report = succeed(prepare("check").arg(&folder));
-    assert!(report.contains("3 subjects, 12 views: no fault"), "{report}");
+    assert_says(&succeed(prepare("check").arg(&folder)), &["3 subjects, 12 views: no fault"]);
     let sheet = image::open(&sheet).expect("a picture").into_rgb8();
     let colors: std::collections::HashSet<[u8; 3]> = sheet.pixels().map(|p| p.0).collect();
     assert!(sheet.width() == 9 * 192 && colors.len() > 500, "{:?}", sheet.dimensions());
@@ -76,10 +75,9 @@ fn shards_and_reruns_give_what_one_run_gives() {
     // Settings of the cameras that `dataset.toml` does not have.
     let before = files(&shared);
     for key in ["views.pitch", "views.distance"] {
-        let message = refused(synth(&shared, "5").args(["--set", &format!("{key}=2.0")]));
-        assert!(
-            message.contains("prepare.config.toml") && message.contains(&format!("`{key}`")),
-            "{message}"
+        assert_says(
+            &refused(synth(&shared, "5").args(["--set", &format!("{key}=2.0")])),
+            &["prepare.config.toml", &format!("`{key}`")],
         );
     }
     let mut given = prepare("synth");
@@ -266,12 +264,10 @@ fn wrong_arguments_are_refused_before_any_work() {
         fs::create_dir_all(&set).expect("make");
         let mut command = prepare("synth");
         command.arg("-o").arg(&set).arg("--preview").arg(temporary.path().join(sheet));
-        let message = refused(&mut command);
-        assert!(message.contains(reason), "{message}");
+        assert_says(&refused(&mut command), &[reason]);
         assert_eq!(files(&set).len(), 0);
     }
-    let message = refused(prepare("check").arg(temporary.path()));
-    assert!(message.contains("is no data set"), "{message}");
+    assert_says(&refused(prepare("check").arg(temporary.path())), &["is no data set"]);
     let message = refused(prepare("makehuman").arg(temporary.path()).arg("-o").arg(&out));
     assert!(message.contains("is no MakeHuman data"), "{message}");
 }

@@ -8,7 +8,7 @@ use glam::{DVec2, DVec3, Vec3};
 use snapsnap_splat::{Camera, Gaussians, Orbit, RenderOptions, render, scene, sh};
 use snapsnap_tests::ply::{Format, cloud, ply_bytes};
 use snapsnap_tests::workplace::Workplace;
-use snapsnap_tests::{Numbers, ended_with, sample, succeed, values};
+use snapsnap_tests::{Numbers, assert_says, ended_with, sample, succeed, values};
 
 /// `render` in this folder on the CPU.
 fn run(place: &Workplace, line: &str) -> Command {
@@ -24,8 +24,7 @@ fn an_orbit_gives_pictures_cameras_and_raw_tensors() {
     let place = Workplace::empty();
     place.write("in.ply", ply_bytes(&cloud(3000, 2), Format::Little, "", b""));
     let orbit = "in.ply --orbit 3 --size 80x64 --background 0.2,0.4,1 -o out --raw raw -v";
-    let printed = succeed(&mut run(&place, orbit));
-    assert!(printed.contains("3 views of 3000 Gaussians") && printed.contains("visible"), "{printed}");
+    assert_says(&succeed(&mut run(&place, orbit)), &["3 views of 3000 Gaussians", "visible"]);
 
     // The library, asked directly.
     let device = Device::flex();

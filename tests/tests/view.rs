@@ -9,7 +9,7 @@ use burn::tensor::Device;
 use snapsnap_splat::scene;
 use snapsnap_tests::ply::balls;
 use snapsnap_tests::server::Server;
-use snapsnap_tests::{data, refused, snapsnap};
+use snapsnap_tests::{assert_says, data, refused, snapsnap};
 
 #[test]
 fn the_page_and_its_file_are_served_to_this_machine_alone() {
@@ -151,8 +151,7 @@ fn clients_that_do_not_read_cost_neither_memory_nor_places() {
 #[test]
 fn what_cannot_be_shown_is_refused_at_once() {
     let temporary = tempfile::tempdir().expect("temporary folder");
-    let message = refused(snapsnap().arg("view").arg(temporary.path().join("none.ply")));
-    assert!(message.contains("none.ply"), "{message}");
+    assert_says(&refused(snapsnap().arg("view").arg(temporary.path().join("none.ply"))), &["none.ply"]);
     let file = data("spz/v3_degree0.spz");
     let server = Server::new(&file);
     let taken = server.port.to_string();

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use snapsnap_tests::{ended_with, refused, snapsnap, succeed};
+use snapsnap_tests::{assert_says, ended_with, refused, snapsnap, succeed};
 
 use super::{json, people, weights};
 
@@ -75,6 +75,5 @@ fn every_setting_is_measured_with_its_omissions() {
     assert!(refused(&mut bench(&["--set", "bench.runs=0"])).contains("bench.runs"));
     assert!(refused(&mut bench(&["--set", "settings.a.stride=0"])).contains("stride"));
     assert!(refused(&mut bench(&["--set", "settings.a.inputs=[0]"])).contains("settings.a.inputs"));
-    let said = refused(&mut bench(&["--weights", "nowhere.safetensors"]));
-    assert!(said.contains("nowhere.safetensors"), "{said}");
+    assert_says(&refused(&mut bench(&["--weights", "nowhere.safetensors"])), &["nowhere.safetensors"]);
 }

@@ -6,7 +6,7 @@ use std::process::Command;
 
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use serde_json::Value;
-use snapsnap_tests::{data, ended_with, refused, snapsnap, succeed};
+use snapsnap_tests::{assert_says, data, ended_with, refused, snapsnap, succeed};
 
 fn compare(a: &Path, b: &Path) -> Command {
     let mut command = snapsnap();
@@ -50,8 +50,7 @@ fn a_mask_has_the_figures_of_scikit_image_and_a_margin() {
 #[test]
 fn a_picture_is_infinitely_like_itself_and_that_is_printed() {
     let sheet = data("metrics/people.png");
-    let said = succeed(&mut compare(&sheet, &sheet));
-    assert!(said.contains("inf dB") && said.contains("1.000000"), "{said}");
+    assert_says(&succeed(&mut compare(&sheet, &sheet)), &["inf dB", "1.000000"]);
     let found = json(&mut compare(&sheet, &sheet));
     assert_eq!(
         (&found["psnr"], &found["ssim"], &found["ssim_gaussian"]),

@@ -7,7 +7,7 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 
 use serde_json::Value;
-use snapsnap_tests::{ended_with, refused, root, snapsnap, succeed};
+use snapsnap_tests::{assert_says, ended_with, refused, root, snapsnap, succeed};
 
 use super::{copied, evaluate, json, people, weights};
 
@@ -190,10 +190,9 @@ fn networks_of_neighbours_are_refused_for_other_photographs() {
     };
     // Eight views.
     succeed(&mut run("quarters", "[0, 2, 4, 6]"));
-    let said = ended_with(1, &mut run("others", "[0, 3, 6]"));
-    assert!(
-        said.contains("135.0° apart") && said.contains("`network.pair_degrees` of the weights is 90"),
-        "{said}"
+    assert_says(
+        &ended_with(1, &mut run("others", "[0, 3, 6]")),
+        &["135.0° apart", "`network.pair_degrees` of the weights is 90"],
     );
     let mut command = snapsnap();
     let photographs = ["front.png", "back.png"].map(|name| root().join("assets/sample").join(name));
@@ -382,10 +381,8 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     wrong(&["--lpips", "nowhere.pth"], &["nowhere.pth"]);
     wrong(&["--align", "nowhere"], &["--align", "similarity"]);
     wrong(&["--set", "metrics.align=\"nowhere\""], &["unknown variant `nowhere`", "`similarity`"]);
-    let said = refused(&mut evaluate(people(), &people().join("report"), &[]));
-    assert!(said.contains("lies in a data set"), "{said}");
-    let said = refused(&mut evaluate(temporary.path(), &report, &[]));
-    assert!(said.contains("is no data set"), "{said}");
+    assert_says(&refused(&mut evaluate(people(), &people().join("report"), &[])), &["lies in a data set"]);
+    assert_says(&refused(&mut evaluate(temporary.path(), &report, &[])), &["is no data set"]);
     wrong(&["--set", "metrics.protocols=[\"paper\", \"paper\"]"], &["metrics.protocols", "twice"]);
     wrong(&["--set", "views.compared=[1, 99]"], &["no view 99, of 8", "views.compared"]);
     let again = format!(
@@ -398,8 +395,7 @@ fn wrong_evaluations_are_refused_with_the_reason() {
         .args(["evaluate", "--config"])
         .arg(root().join("configs/eval.toml"))
         .args(["--set", &again, "-o"]);
-    let said = refused(command.arg(&report));
-    assert!(said.contains("data.folders") && said.contains("twice"), "{said}");
+    assert_says(&refused(command.arg(&report)), &["data.folders", "twice"]);
     // `..` after a folder that does not exist.
     let said = refused(&mut evaluate(people(), &people().join("no/../report"), &[]));
     assert!(said.contains("lies in a data set") && !people().join("no").exists(), "{said}");
@@ -410,8 +406,7 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     let training = temporary.path().join("training");
     fs::create_dir(&training).expect("a folder");
     fs::write(training.join("config.toml"), "[training]").expect("writes");
-    let said = refused(&mut evaluate(people(), &training, &[]));
-    assert!(said.contains("config.toml") && said.contains("belongs to no report"), "{said}");
+    assert_says(&refused(&mut evaluate(people(), &training, &[])), &["config.toml", "belongs to no report"]);
     assert_eq!(fs::read_dir(&training).expect("there").count(), 1);
     // A report does not replace its inputs.
     fs::create_dir(&report).expect("a folder");
@@ -421,7 +416,6 @@ fn wrong_evaluations_are_refused_with_the_reason() {
     fs::write(&config, "[views]\n").expect("writes");
     let mut command = snapsnap();
     command.args(["evaluate", "--config"]).arg(&config).arg("--data").arg(people()).arg("-o").arg(&report);
-    let said = refused(&mut command);
-    assert!(said.contains("would be overwritten"), "{said}");
+    assert_says(&refused(&mut command), &["would be overwritten"]);
     assert_eq!(fs::read_to_string(&config).expect("kept"), "[views]\n");
 }

@@ -5,7 +5,9 @@ use std::time::{Duration, Instant};
 use std::{fs, thread};
 
 use snapsnap_net::weights::Source;
-use snapsnap_tests::{copy_folder, ended_with, files, fill_weights, refused, succeed, synthetic_people};
+use snapsnap_tests::{
+    assert_says, copy_folder, ended_with, files, fill_weights, refused, succeed, synthetic_people,
+};
 
 use super::{logged, people, place, results, train, train_on};
 
@@ -35,20 +37,16 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     wrong(&["--minutes", "0"], &["--minutes", "more than 0"]);
     wrong(&["--minutes", "1e9"], &["--minutes", "at most"]);
     wrong(&["--weights", "nowhere.safetensors"], &["nowhere.safetensors"]);
-    let said = refused(&mut train(2, &config, &run));
-    assert!(said.contains("point predictor") && said.contains("--weights"), "{said}");
-    let said = refused(&mut train(1, &config, &people().join("run")));
-    assert!(said.contains("lies in a data set"), "{said}");
+    assert_says(&refused(&mut train(2, &config, &run)), &["point predictor", "--weights"]);
+    assert_says(&refused(&mut train(1, &config, &people().join("run"))), &["lies in a data set"]);
 
     // A run is not begun twice, nor continued with other networks or another stage.
     succeed(train(1, &config, &run).args(["--set", "training.steps=2"]));
     let before = results(&run);
-    let said = refused(&mut train(1, &config, &run));
-    assert!(said.contains("--resume"), "{said}");
+    assert_says(&refused(&mut train(1, &config, &run)), &["--resume"]);
     let said = refused(train(1, &config, &run).args(["--resume", "--set", "network.enc_depth=2"]));
     assert!(said.contains("other [network]"), "{said}");
-    let said = refused(train(2, &config, &run).args(["--resume"]));
-    assert!(said.contains("stage 1"), "{said}");
+    assert_says(&refused(train(2, &config, &run).args(["--resume"])), &["stage 1"]);
     // Tensors of the same shapes that mean something else.
     let other = temporary.path().join("meaning");
     for (key, named) in
@@ -64,8 +62,7 @@ fn wrong_settings_weights_and_folders_are_refused_by_name() {
     assert!(results(&run) == before);
     let huge = ["training.batch", "network.resolution", "network.net_resolution"];
     let huge = huge.map(|key| format!("--set={key}=4096"));
-    let said = refused(train(1, &config, &run.join("other")).args(huge));
-    assert!(said.contains("GB of memory"), "{said}");
+    assert_says(&refused(train(1, &config, &run.join("other")).args(huge)), &["GB of memory"]);
 }
 
 /// The finished weights of a run whose state was removed, and files of the user's own.
@@ -85,8 +82,7 @@ fn a_new_run_replaces_no_file() {
         let own = temporary.path().join(name.replace('/', "-"));
         fs::create_dir_all(own.join("previews")).expect("makes");
         fs::write(own.join(name), "the user's own").expect("writes");
-        let said = refused(&mut train(1, &config, &own));
-        assert!(said.contains("would be replaced"), "{said}");
+        assert_says(&refused(&mut train(1, &config, &own)), &["would be replaced"]);
         assert_eq!(fs::read_to_string(own.join(name)).expect("reads"), "the user's own");
         assert!(!own.join("lock").exists(), "a refused start leaves nothing");
     }
@@ -102,14 +98,12 @@ fn links_and_pipes_in_a_run_are_refused() {
     fs::write(&other, "the user's own").expect("writes");
     fs::remove_file(run.join("log.jsonl")).expect("removes");
     std::os::unix::fs::symlink(&other, run.join("log.jsonl")).expect("links");
-    let said = refused(train(1, &config, &run).arg("--resume"));
-    assert!(said.contains("log.jsonl: is a link"), "{said}");
+    assert_says(&refused(train(1, &config, &run).arg("--resume")), &["log.jsonl: is a link"]);
     assert_eq!(fs::read_to_string(&other).expect("reads"), "the user's own");
     let piped = temporary.path().join("piped");
     fs::create_dir(&piped).expect("makes");
     assert!(std::process::Command::new("mkfifo").arg(piped.join("lock")).status().expect("mkfifo").success());
-    let said = refused(&mut train(1, &config, &piped));
-    assert!(said.contains("lock: is no regular file"), "{said}");
+    assert_says(&refused(&mut train(1, &config, &piped)), &["lock: is no regular file"]);
 }
 
 #[test]
@@ -158,8 +152,7 @@ fn a_run_is_continued_only_as_itself() {
     let other = temporary.path().join("other");
     succeed(train(1, &config, &other).args(["--set=training.steps=2", "--set=training.seed=8"]));
     fs::copy(other.join("state/state.safetensors"), run.join("state/state.safetensors")).expect("copies");
-    let said = refused(&mut resumed(people(), &[]));
-    assert!(said.contains("`training.seed` is 8 there"), "{said}");
+    assert_says(&refused(&mut resumed(people(), &[])), &["`training.seed` is 8 there"]);
     succeed(&mut resumed(people(), &["--force"]));
 }
 
@@ -175,8 +168,7 @@ fn averages_begin_with_the_weights() {
         command
     };
     let before = results(&run);
-    let said = refused(&mut resumed());
-    assert!(said.contains("`training.ema_decay`") && said.contains("--force"), "{said}");
+    assert_says(&refused(&mut resumed()), &["`training.ema_decay`", "--force"]);
     assert!(results(&run) == before);
     let values = || {
         let weights = Source::open(&run.join("last.safetensors")).expect("weights");
@@ -269,11 +261,7 @@ fn stage_2_continues_with_its_own_predictor_only() {
         command
     };
     succeed(&mut resumed(3, 0));
-    let said = refused(&mut resumed(4, 1));
-    assert!(
-        said.contains("the frozen point predictor has other weights") && said.contains("--force"),
-        "{said}"
-    );
+    assert_says(&refused(&mut resumed(4, 1)), &["the frozen point predictor has other weights", "--force"]);
     // From the first moment on, the run's predictor is the second one.
     let mut killed = resumed(1_000_000, 1);
     let mut killed = killed.args(["--force", "--set=training.checkpoint_every=0"]).spawn().expect("starts");

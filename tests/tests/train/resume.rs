@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use snapsnap_tests::{ended, ended_with, limited, refused, snapsnap, succeed};
+use snapsnap_tests::{assert_says, ended, ended_with, limited, refused, snapsnap, succeed};
 
 use super::{logged, place, results, train};
 
@@ -100,8 +100,7 @@ fn a_full_disk_leaves_the_last_checkpoint_and_exit_code_2() {
     let run = temporary.path().join("run");
     succeed(train(1, &config, &run).args(["--set", "training.steps=8"]));
     let before = results(&run);
-    let said = refused(&mut limited(train(1, &config, &run).arg("--resume"), "-f 20"));
-    assert!(said.contains("cannot write"), "{said}");
+    assert_says(&refused(&mut limited(train(1, &config, &run).arg("--resume"), "-f 20")), &["cannot write"]);
     assert!(results(&run) == before, "a file was changed");
     succeed(train(1, &config, &run).arg("--resume"));
     assert_eq!(logged(&run, "loss").len(), 40);

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use snapsnap_tests::{Numbers, TRAINING, refused, snapsnap, succeed};
+use snapsnap_tests::{Numbers, TRAINING, assert_says, refused, snapsnap, succeed};
 
 use super::{logged, people, place, train};
 
@@ -34,9 +34,7 @@ fn both_stages_learn_and_write_weights_for_reconstructions() {
     assert_eq!((height - 28) % 4, 0);
     assert_eq!(width % (4 * (height - 28) / 4), 0);
     let svg = fs::read_to_string(one.join("curves.svg")).expect("curves");
-    for part in ["<polyline", "held-out people: error of points", "\nmm\n", "\nstep\n"] {
-        assert!(svg.contains(part), "{part}: {svg}");
-    }
+    assert_says(&svg, &["<polyline", "held-out people: error of points", "\nmm\n", "\nstep\n"]);
 
     // The printed command runs as it is, but for the photographs. The file of stage 2 contains both networks.
     let said = succeed(train(2, &config, &two).arg("--weights").arg(&weights));
@@ -104,8 +102,7 @@ fn details_are_trained_alone() {
 fn a_rehearsal_writes_nothing_and_prints_the_time_of_the_run() {
     let (temporary, config) = place();
     let run = temporary.path().join("run");
-    let said = succeed(train(1, &config, &run).arg("--dry-run"));
-    assert!(said.contains("40 steps will take about") && said.contains("memory"), "{said}");
+    assert_says(&succeed(train(1, &config, &run).arg("--dry-run")), &["40 steps will take about", "memory"]);
     assert!(!run.exists());
 }
 

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use snapsnap_tests::{copy_folder, ended_with, refused, succeed};
+use snapsnap_tests::{assert_says, copy_folder, ended_with, refused, succeed};
 
 use super::{logged, people, place, results, train, train_on};
 
@@ -61,13 +61,11 @@ fn failed_validations_cost_no_step() {
     let pictures: Vec<PathBuf> = (0..4).map(|view| copy.join(format!("val/img/0000/{view}.png"))).collect();
     let sound: Vec<Vec<u8>> = pictures.iter().map(|path| fs::read(path).expect("reads")).collect();
     pictures.iter().for_each(|path| fs::write(path, b"not a picture").expect("writes"));
-    let said = refused(&mut train());
-    assert!(said.contains("no validation after step 10") && said.contains("val/img/0000/"), "{said}");
+    assert_says(&refused(&mut train()), &["no validation after step 10", "val/img/0000/"]);
     assert_eq!(logged(&run, "loss").len(), 40);
     assert!(logged(&run, "validation/points_mm").is_empty() && !run.join("best.safetensors").exists());
     pictures.iter().zip(&sound).for_each(|(path, bytes)| fs::write(path, bytes).expect("writes"));
-    let said = refused(&mut train());
-    assert!(said.contains("the data sets have other content"), "{said}");
+    assert_says(&refused(&mut train()), &["the data sets have other content"]);
     succeed(train().arg("--force"));
     assert_eq!(logged(&run, "validation/points_mm").len(), 1);
     assert!(run.join("best.safetensors").exists() && run.join("previews/0000040.png").exists());
