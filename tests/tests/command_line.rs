@@ -5,7 +5,7 @@ use std::path::Path;
 
 use image::{DynamicImage, GrayImage, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use snapsnap_tests::workplace::{Workplace, person};
-use snapsnap_tests::{Numbers, assert_says, fill_weights, refused, root, shared_folder, succeed};
+use snapsnap_tests::{Numbers, assert_says, fill_weights, refused, root, set_tensor, shared_folder, succeed};
 
 /// Properties and rows of a binary PLY.
 fn read_ply(path: &Path) -> (Vec<String>, Vec<Vec<f32>>) {
@@ -122,15 +122,10 @@ fn masks_from_files_equal_masks_from_alpha() {
 fn exif_orientation_is_honoured() {
     let place = Workplace::with_weights();
     // A JPEG turned a quarter, whose EXIF tag (6: turn right by 90°) says so, is the upright picture.
-    let upright = DynamicImage::ImageRgba8(person(200, 320, 1, 0)).into_rgb8();
-    let turned = image::imageops::rotate270(&upright);
-    let mask = |name: &str, turned: bool| {
-        let rgba = person(200, 320, 1, 0);
-        let mask = GrayImage::from_fn(200, 320, |x, y| Luma([rgba.get_pixel(x, y)[3]]));
-        let mask = if turned { image::imageops::rotate270(&mask) } else { mask };
-        mask.save(place.path(name)).expect("PNG");
-    };
-    mask("upright.png", false);
+    let upright = person(200, 320, 1, 0);
+    let mask = GrayImage::from_fn(200, 320, |x, y| Luma([upright.get_pixel(x, y)[3]]));
+    mask.save(place.path("upright.png")).expect("PNG");
+    let turned = image::imageops::rotate270(&DynamicImage::ImageRgba8(upright).into_rgb8());
     let mut jpeg = Vec::new();
     image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 100).encode_image(&turned).expect("JPEG");
     // APP1 segment: "Exif", little-endian TIFF with one entry, tag 0x0112 (orientation) = 6.
@@ -219,11 +214,7 @@ fn unsuitable_configs_weights_devices_and_outputs_are_refused_by_name() {
     // Without --weights it is the default ones that do not fit.
     let message = refused(&mut place.run("reconstruct front.png back.png --set network.enc_dim=64"));
     assert!(message.contains("the default weights") && message.contains("not 64"), "{message}");
-    // A NaN in the last tensor.
-    let mut weights = place.read("w");
-    let at = weights.len() - 4;
-    weights[at..].copy_from_slice(&f32::NAN.to_le_bytes());
-    place.write("w", weights);
+    set_tensor(&place.path("w"), "gs_conv.bias", &[f32::NAN]);
     case("--device cpu", &["not finite", "gs_conv.bias"]);
     assert!(refused(&mut place.run("reconstruct")).starts_with("error"));
 }
