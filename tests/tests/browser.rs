@@ -10,7 +10,7 @@ use base64::prelude::{BASE64_STANDARD, Engine};
 use serde_json::{Value, json};
 use snapsnap_tests::browser::Page;
 use snapsnap_tests::server::Server;
-use snapsnap_tests::{data, sample, snapsnap, succeed};
+use snapsnap_tests::{assert_says, data, sample, snapsnap, succeed};
 
 const SIDE: u32 = 768;
 /// Longest time until a state of the page.
@@ -214,10 +214,7 @@ fn a_browser_shows_the_person_and_turns_it() {
     page.wait("window.saved.length === 1");
     assert_eq!(page.value("window.saved[0]"), "human.glb");
     let said = page.value("[...window.said].join('|')").to_string();
-    assert!(
-        said.contains("Making the mesh: views from all around … ") && said.contains("texture … "),
-        "{said}"
-    );
+    assert_says(&said, &["Making the mesh: views from all around … ", "texture … "]);
 
     // The background has the chosen colour.
     page.value(&choose("chosen"));

@@ -71,10 +71,7 @@ fn weights_of_another_size_are_refused_in_a_few_lines() {
     let place = Workplace::with_weights();
     let full = root().join("configs/full.toml");
     let said = refused(place.run("reconstruct a.png b.png --weights w --config").arg(&full));
-    assert!(
-        said.contains("not the weights of the configured networks") && said.contains("`network."),
-        "{said}"
-    );
+    assert_says(&said, &["not the weights of the configured networks", "`network."]);
     assert!(said.lines().count() < 4, "{said}");
     // An import has no stored config to compare.
     let said = refused(place.run("import-weights w -o x.safetensors --config").arg(&full));

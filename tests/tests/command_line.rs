@@ -28,11 +28,10 @@ fn read_ply(path: &Path) -> (Vec<String>, Vec<Vec<f32>>) {
 fn two_pictures_become_a_finite_ply_with_config_and_plan() {
     let place = Workplace::with_weights();
     let printed = succeed(&mut place.reconstruct("front.png back.png -v -o human.ply"));
-    for line in
-        ["encoder", "decoders", "heads (4)", "regressor (front, back)", "pixels become Gaussians", "total"]
-    {
-        assert!(printed.contains(line), "{line}: {printed}");
-    }
+    assert_says(
+        &printed,
+        &["encoder", "decoders", "heads (4)", "regressor (front, back)", "pixels become Gaussians", "total"],
+    );
     let (names, rows) = read_ply(&place.path("human.ply"));
     // INRIA's order.
     let expected =
