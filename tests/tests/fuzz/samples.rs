@@ -149,7 +149,8 @@ pub fn make(folder: &Path, name: &str) {
         // Scans with the parameters of their bodies.
         "scans" => {
             make(&path, "a.obj");
-            for subject in ["protocol2", "protocol4", "big_endian", "numpy2"] {
+            copy("crates/data/tests/smplx/numpy2.pkl", &path.join("a.pkl"));
+            for subject in ["protocol2", "protocol4", "big_endian"] {
                 let parameters = format!("{subject}.pkl");
                 copy(&format!("crates/data/tests/smplx/{parameters}"), &path.join(parameters));
                 put(&path.join(format!("{subject}.obj")), PYRAMID);
