@@ -191,7 +191,8 @@ impl Text {
             Self::Items(list) => {
                 let start = pick(list, &runs(bytes, |b| b == b'[')).end;
                 let item = [first_value(&bytes[start..]), b","].concat();
-                bytes.splice(start..start, repeated(&item, MANY));
+                // Each may be a picture that is drawn.
+                bytes.splice(start..start, repeated(&item, MANY / 25));
             }
         }
     }
