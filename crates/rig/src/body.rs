@@ -97,10 +97,11 @@ impl Body {
         let is_near = |cell: &usize| {
             offset(cell).dot(along).abs() <= self.grid.cell && offset(cell).length() <= 2.0 * radius
         };
-        let mut left: HashSet<usize> = self.inside.iter().copied().filter(is_near).collect();
+        // In the order of the cells, so that the first of several nearest ones is always the same.
+        let near: Vec<usize> = self.inside.iter().copied().filter(is_near).collect();
         let nearest = |a: &&usize, b: &&usize| offset(a).length().total_cmp(&offset(b).length());
-        let first = left.iter().min_by(nearest).copied().filter(|cell| offset(cell).length() <= radius)?;
-        left.remove(&first);
+        let first = *near.iter().min_by(nearest).filter(|cell| offset(cell).length() <= radius)?;
+        let mut left: HashSet<usize> = near.into_iter().filter(|cell| *cell != first).collect();
         let mut section = vec![first];
         let mut seen = 0;
         while let Some(cell) = section.get(seen) {

@@ -65,7 +65,11 @@ pub fn run(arguments: &Arguments) -> Result<(), Failure> {
     let inputs: Vec<&Path> = [input].into_iter().chain(pose).chain(motion).map(PathBuf::as_path).collect();
     check_outputs(&[output], &inputs)?;
     let pose = pose.as_deref().map(|pose| read_pose(pose, arguments.frame)).transpose()?;
-    let motions = motion.iter().map(|path| Ok((path, read_motion(path)?)));
+    let motions = motion.iter().map(|path| match read_motion(path)? {
+        Motion { ref poses, .. } if poses.is_empty() => Err(Failure::file(path, "has no frames")),
+        Motion { step, .. } if step <= 0.0 => Err(Failure::file(path, "has no time between its frames")),
+        motion => Ok((path, motion)),
+    });
     let motions = motions.collect::<Result<Vec<_>, Failure>>()?;
 
     let scene = read(input)?.load(&device::choose(&arguments.device)?);
@@ -120,14 +124,7 @@ fn read_motion(path: &Path) -> Result<Motion, Failure> {
     if path.extension().is_none_or(|extension| !extension.eq_ignore_ascii_case("bvh")) {
         return Err(Failure::file(path, "is no .bvh, and no pose or motion of this name exists"));
     }
-    let motion = poses::read(path)?;
-    if motion.poses.is_empty() {
-        return Err(Failure::file(path, "has no frames"));
-    }
-    if motion.step <= 0.0 {
-        return Err(Failure::file(path, "has no time between its frames"));
-    }
-    Ok(motion)
+    Ok(poses::read(path)?)
 }
 
 /// The pose that `--pose` names.
