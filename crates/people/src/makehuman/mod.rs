@@ -43,10 +43,10 @@ pub fn person(
     Ok(rigged(library, name, poses, None, detail)?.0)
 }
 
-/// The person of [`person`], perhaps in another pose, with the bones of MakeHuman's default rig.
+/// The person of [`person()`], perhaps in another pose, with the bones of MakeHuman's default rig.
 ///
 /// # Errors
-/// As [`person`].
+/// As [`person()`].
 pub fn rigged(
     library: &Library,
     name: &str,
